@@ -176,7 +176,7 @@ def test_actions_of_synthetic_rows_are_not_imitated(name, key) -> None:
 
 UNBOUNDED = ["discrete", "discrete-cql", "choice-model", "iql", "fqe"]
 READS_NONE = ["recovery", "recovery-delta", "recovery-module"]
-REAL = [name for name in LOSSES if LOSSES[name].action == "continuous"]
+CONTINUOUS = [name for name in LOSSES if LOSSES[name].action == "continuous"]
 WITH_BOUNDS = [name for name in LOSSES if name not in (*UNBOUNDED, *READS_NONE)]
 
 
@@ -200,7 +200,7 @@ def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
         make_loss(name, networks, **options)(batch)
 
 
-@pytest.mark.parametrize("name", sorted({*REAL} - {*READS_NONE}))
+@pytest.mark.parametrize("name", sorted({*CONTINUOUS} - {*READS_NONE}))
 def test_actions_of_another_shape_are_named(name) -> None:
     """``[B]`` would broadcast where B is the number of dimensions."""
     loss, batch = make_loss(name), make_batch(name, 2)

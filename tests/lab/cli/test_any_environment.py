@@ -278,7 +278,7 @@ def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(
         (["env.id=Pendulum-v1", "path=there.npz"], "there.npz exists"),
         (["path=log.npz"], "env.id is not given"),
         (["env=hopper", "path=a.npz", "policy=good"], "no run .* at good"),
-        (["env=hopper", "path=a.npz", "policy=no:act"], "policy=no:act: No mod"),
+        (["env=hopper", "path=a.npz", "policy=no:act"], "no:act: No module named 'no'"),
     ],
 )
 def test_collect_refuses_in_a_sentence(overrides, message, tmp_path, monkeypatch):
