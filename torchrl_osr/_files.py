@@ -9,7 +9,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,11 +34,17 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(beside, path)
     except OSError as error:
-        raise OSError(
-            error.errno, f"cannot write the file ({error.strerror})", str(path)
-        ) from error
+        text = f"cannot write the file ({error.strerror})"
+        raise OSError(error.errno, text, str(path)) from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # there is none, or the disk is read-only
+            beside.unlink()
+
+
+def check_writable(folder: Path) -> None:
+    """Raise a PermissionError unless files can be written there: before a long job."""
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} is read-only: work on a copy of it elsewhere.")
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

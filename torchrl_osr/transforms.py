@@ -126,8 +126,7 @@ class StatePerturbation(Transform):
             tensordict.set(out_key, torch.addcmul(state, noise, self.std.to(state)))
         return tensordict
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self.forward(next_tensordict)
+    _call = forward
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

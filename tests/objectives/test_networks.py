@@ -218,9 +218,17 @@ def test_a_frozen_network_has_the_weights_that_a_loss_loads() -> None:
     held = loss.inverse_dynamics_network.parameters()
     assert all(map(torch.equal, held, other.inverse_dynamics_network.parameters()))
     model = make_networks("osr", seed=4).model
-    loss.load_frozen("inverse_dynamics_network", model)
+    loss.from_stateful_net("inverse_dynamics_network", model)
     held = loss.inverse_dynamics_network.parameters()
     assert all(map(torch.equal, held, model.parameters()))
+
+
+def test_a_policy_that_is_first_asked_without_gradient_has_one() -> None:
+    loss = make_loss("cql")
+    policy = loss.policy(loss.unpack(make_batch("cql", 4)))
+    with torch.no_grad():
+        policy["clean"]
+    assert policy["clean"].loc.requires_grad
 
 
 def test_a_loss_is_where_its_networks_are(monkeypatch) -> None:

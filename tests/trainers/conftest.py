@@ -84,8 +84,8 @@ def undisturbed(make, tmp_path) -> OfflineTrainer:
 @pytest.fixture
 def logger() -> SimpleNamespace:
     """Logger with ``numbers``: name, step and value of each."""
-    numbers = []
+    rows = []
     return SimpleNamespace(
-        numbers=numbers,
-        log_scalar=lambda name, value, step: numbers.append((name, step, value)),
+        numbers=rows,
+        log_metrics=lambda of, step: rows.extend((n, step, v) for n, v in of.items()),
     )

@@ -67,14 +67,9 @@ class FusedCritics(Critics):
             )
         params, state = loss.qvalue_network_params, self._state(states)
         layers = self._layers(params)
-        autocast = torch.is_autocast_enabled("cpu")
-        given = (
-            [len(each) for each in layers],
-            eps,
-            loss.temperature,
-            torch.get_autocast_dtype("cpu") if autocast else None,
-            *(state, action, log_prob),
-        )
+        autocast, sizes = torch.is_autocast_enabled("cpu"), [*map(len, layers)]
+        dtype = torch.get_autocast_dtype("cpu") if autocast else None
+        given = sizes, eps, loss.temperature, dtype, state, action, log_prob
         soft_maximum = _SoftMaximum.apply(alike, given, *sum(layers, ()))
         return self.values(states, compared, params), soft_maximum
 
@@ -116,11 +111,9 @@ class FusedCritics(Critics):
         for name, each in self.loss.qvalue_network.module.named_children():
             if type(each) is not nn.ReLU:
                 own = params["module", name]
-                pair = own["weight"], own["bias"]
                 if type(each) is nn.Linear:
-                    layers.append(pair)
-                else:
-                    layers[-1] += pair
+                    layers.append(())
+                layers[-1] += own["weight"], own["bias"]
         return layers
 
     def _state(self, states: TensorDictBase) -> Any:

@@ -249,10 +249,8 @@ class _Trace:
         pairs = zip(self._parameters, found, strict=True)
         given = [(each, value) for each, value in pairs if value is not None]
         self._trained, self._names = [each for each, _ in given], list(losses.keys())
-        self._written = [
-            key for key, value in batch.items(True, True)
-            if inputs.get(key) is not value
-        ]  # fmt: skip
+        items = batch.items(True, True)
+        self._written = [key for key, value in items if inputs.get(key) is not value]
         return [
             *(value.detach() for value in losses.values()),
             *(batch.get(key) for key in self._written),
@@ -260,9 +258,7 @@ class _Trace:
         ]
 
     @torch.no_grad()
-    def spread(
-        self, outputs: Sequence[Tensor], batch: TensorDictBase
-    ) -> TensorDictBase:
+    def spread(self, outputs: list[Tensor], batch: TensorDictBase) -> TensorDictBase:
         """Put written entries into the batch, add gradients, and return the losses."""
         number = len(self._names) + len(self._written)
         # A CUDA graph writes its outputs once more at the next update.

@@ -22,8 +22,6 @@ COMMANDS = (
 )  # fmt: skip
 """``conf/help.txt`` describes them."""
 
-COLUMNS = "data.columns=", "data.columns."
-
 CONFIGS = {
     "data": "check_data", "train": "train", "collect": "collect",
     "evaluate": "evaluation/evaluate",
@@ -57,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # For modules of the user's; last, where they replace no installed package.
         sys.path.append(os.getcwd())
         with errors_as_sentences():
-            if len({each[:13] for each in rest} & {*COLUMNS}) > 1:
+            if {each[:13] for each in rest} >= {"data.columns=", "data.columns."}:
                 raise ValueError(
                     "data.columns=<file> replaces all data.columns.<part>=...: write "
                     "these into the file."

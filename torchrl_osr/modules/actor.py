@@ -1,6 +1,6 @@
 """Policies of one observation: tanh-Gaussian, deterministic, Gaussian and categorical.
 
-All take ``observation_dim`` (``S``), ``action_dim`` (``A``) and these keywords:
+All take ``observation_dim`` (``S``), ``action_dim`` (``A``; or ``num_actions``) and:
 
 - ``num_cells``: width of each hidden layer. Default 256 and 256.
 - ``activation_class``: activation between the layers. Default ReLU.
@@ -104,10 +104,8 @@ def tanh_gaussian_actor(
         >>> actor(TensorDict({"observation": torch.zeros(4, 11)}, [4]))["action"].shape
         torch.Size([4, 3])
     """
-    network = nn.Sequential(
-        mlp(observation_dim, 2 * action_dim, num_cells, activation_class),
-        NormalParamExtractor(SCALE_MAPPING),
-    )
+    layers = mlp(observation_dim, 2 * action_dim, num_cells, activation_class)
+    network = nn.Sequential(layers, NormalParamExtractor(SCALE_MAPPING))
     module = TensorDictModule(network, [observation_key], ["loc", "scale"])
     return tanh_normal(module, action_key, low, high)
 
@@ -156,11 +154,8 @@ def gaussian_actor(
     deviation is learned, the same for all states. It writes ``"loc"`` (the mean),
     ``"scale"`` and the action, each ``[B, A]``.
     """
-    network = nn.Sequential(
-        mlp(observation_dim, action_dim, num_cells, activation_class),
-        nn.Tanh(),
-        AddStateIndependentNormalScale(action_dim),
-    )
+    mean = mlp(observation_dim, action_dim, num_cells, activation_class)
+    network = nn.Sequential(mean, nn.Tanh(), AddStateIndependentNormalScale(action_dim))
     return ProbabilisticActor(
         TensorDictModule(network, [observation_key], ["loc", "scale"]),
         in_keys=["loc", "scale"],

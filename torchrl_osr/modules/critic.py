@@ -42,16 +42,11 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    sizes = observation_dim + action_dim, 1
-    return [
-        ValueOperator(
-            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
-            in_keys=[observation_key, action_key],
-            # ValueOperator knows an action by the name "action" alone.
-            out_keys=["state_action_value"],
-        )
-        for _ in range(num_qvalue_nets)
-    ]
+    given = observation_dim + action_dim, 1, num_cells, activation_class
+    networks = [mlp(*given, layer_norm=layer_norm) for _ in range(num_qvalue_nets)]
+    # ValueOperator knows an action by the name "action" alone.
+    keys = [observation_key, action_key], ["state_action_value"]
+    return [ValueOperator(each, *keys) for each in networks]
 
 
 def discrete_critic_ensemble(
@@ -68,15 +63,10 @@ def discrete_critic_ensemble(
 
     As :func:`critic_ensemble`; each writes ``"action_value"``, ``[B, n]``.
     """
-    sizes = observation_dim, num_actions
-    return [
-        TensorDictModule(
-            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
-            [observation_key],
-            ["action_value"],
-        )
-        for _ in range(num_qvalue_nets)
-    ]
+    given = observation_dim, num_actions, num_cells, activation_class
+    networks = [mlp(*given, layer_norm=layer_norm) for _ in range(num_qvalue_nets)]
+    keys = [observation_key], ["action_value"]
+    return [TensorDictModule(each, *keys) for each in networks]
 
 
 def state_value(

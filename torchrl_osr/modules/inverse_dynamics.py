@@ -55,14 +55,11 @@ def tanh_gaussian_inverse_dynamics(
         torch.Size([4, 3])
     """
     # MLP joins its two inputs; nn.Sequential, as the actor uses it, takes one only.
-    joint_mlp = TensorDictModule(
-        mlp(2 * observation_dim, 2 * action_dim, num_cells, activation_class),
-        [observation_key, nested("next", observation_key)],
-        ["param"],
-    )
-    extractor = TensorDictModule(
-        NormalParamExtractor(SCALE_MAPPING), ["param"], ["loc", "scale"]
-    )
+    layers = mlp(2 * observation_dim, 2 * action_dim, num_cells, activation_class)
+    keys = [observation_key, nested("next", observation_key)]
+    joint_mlp = TensorDictModule(layers, keys, ["param"])
+    mapping = NormalParamExtractor(SCALE_MAPPING)
+    extractor = TensorDictModule(mapping, ["param"], ["loc", "scale"])
     network = TensorDictSequential(joint_mlp, extractor)
     return tanh_normal(network, action_key, low, high)
 
@@ -118,11 +115,9 @@ def cvae_inverse_dynamics(
     pair = 2 * observation_dim
     encoder = mlp(pair, 2 * latent_dim, [*num_cells, *num_cells[-1:]], activation_class)
     decoder = mlp(pair + latent_dim, 2 * action_dim, num_cells, activation_class)
-    network = TensorDictModule(
-        _ConditionalVAE(encoder, decoder),
-        [observation_key, nested("next", observation_key)],
-        ["loc", "scale", "latent_loc", "latent_scale"],
-    )
+    keys = [observation_key, nested("next", observation_key)]
+    written = ["loc", "scale", "latent_loc", "latent_scale"]
+    network = TensorDictModule(_ConditionalVAE(encoder, decoder), keys, written)
     return tanh_normal(network, action_key, low, high)
 
 

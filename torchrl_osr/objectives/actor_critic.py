@@ -73,8 +73,9 @@ class StatePolicy:
     def __getitem__(self, states: str) -> Any:
         """Return the distribution at a set of states in :data:`SETS`, ``[D, R]``."""
         if states not in self._built:
-            params = self._params[SETS[states]]
-            self._built[states] = self._network.build_dist_from_params(params)
+            with torch.enable_grad():  # kept for those who ask with gradient, later
+                params = self._params[SETS[states]]
+                self._built[states] = self._network.build_dist_from_params(params)
         return self._built[states]
 
 
@@ -135,8 +136,7 @@ class ActorCriticLoss(LossModule):
             Default ``True``.
     """
 
-    _AcceptedKeys = TransitionKeys
-    default_keys = TransitionKeys
+    _AcceptedKeys = default_keys = TransitionKeys
     tensor_keys: TransitionKeys
 
     # convert_to_functional wants every network that a loss may hold annotated.
@@ -206,23 +206,16 @@ class ActorCriticLoss(LossModule):
         if isinstance(qvalue_network, Sequence):
             self.num_qvalue_nets = len(qvalue_network)
         check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=1)
-        self.convert_to_functional(
-            qvalue_network,
-            "qvalue_network",
-            self.num_qvalue_nets,
-            create_target_params=True,
-        )
+        given = qvalue_network, "qvalue_network", self.num_qvalue_nets
+        self.convert_to_functional(*given, create_target_params=True)
         if isinstance(qvalue_network, Sequence) and self.num_qvalue_nets == 1:
             # TorchRL 0.14.1 keeps a list of one as expanded views of its parameters,
             # which no optimizer finds in loss.parameters().
-            own = self.qvalue_network_params.apply(
-                lambda tensor: (
-                    nn.Parameter(tensor.detach().clone())
-                    if tensor.requires_grad
-                    else tensor.clone()
-                ),
-                filter_empty=False,
-            )
+            def copied(tensor: Tensor) -> Tensor:
+                own = tensor.detach().clone()
+                return nn.Parameter(own) if tensor.requires_grad else own
+
+            own = self.qvalue_network_params.apply(copied, filter_empty=False)
             self.qvalue_network_params = TensorDictParams(own, no_convert=True)
         self._make_vmap()
         self.make_value_estimator()
@@ -252,16 +245,8 @@ class ActorCriticLoss(LossModule):
         # a copy. It has the same tensors, and neither drops units nor counts batches.
         own = {id(each): each for each in (*network.parameters(), *network.buffers())}
         self.__dict__[name] = copy.deepcopy(network, own).eval()
-        frozen = getattr(self, f"{name}_params").apply(
-            lambda tensor: tensor.data, filter_empty=False
-        )
+        frozen = getattr(self, f"{name}_params").data
         setattr(self, f"{name}_params", TensorDictParams(frozen, no_convert=True))
-
-    def load_frozen(self, name: str, network: nn.Module) -> None:
-        """Load the weights of a trained network into a frozen one of the same sizes."""
-        held = getattr(self, f"{name}_params")
-        given = TensorDict.from_module(network).detach()
-        held.apply(lambda ours, theirs: ours.copy_(theirs), given, filter_empty=False)
 
     def _reset_module_parameters(self, module_name: str, module: nn.Module) -> None:
         # TorchRL's reset_parameters_recursive would redraw a trained, frozen model.
@@ -323,7 +308,7 @@ class ActorCriticLoss(LossModule):
     ) -> Self:
         """Set the discount of the TD(0) target."""
         names = self._value_estimator_default_keys
-        dispatch_value_estimator(
+        estimator = dispatch_value_estimator(
             self,
             value_type or ValueEstimators.TD0,
             supported=(ValueEstimators.TD0,),
@@ -331,8 +316,7 @@ class ActorCriticLoss(LossModule):
             value_network=None,
             gamma=gamma,
         )
-        for name, buffer in list(self.value_estimator.named_buffers(recurse=False)):
-            self.value_estimator.register_buffer(name, buffer, persistent=False)
+        estimator.register_buffer("gamma", estimator.gamma, persistent=False)
         return self
 
     # -- keys -------------------------------------------------------------------------
@@ -365,9 +349,8 @@ class ActorCriticLoss(LossModule):
         """Return the entries that actor, critics and model read, in order."""
         keys, states = self.tensor_keys, self.observation_keys
         following = [*states, keys.reward, keys.done, keys.terminated]
-        model: list[NestedKey] = []
-        if "inverse_dynamics_network" in self.__dict__:
-            model = list(self.inverse_dynamics_network.in_keys)
+        network = self.__dict__.get("inverse_dynamics_network")
+        model = getattr(network, "in_keys", [])
         following = [nested("next", key) for key in following]
         found = [*states, keys.action, *following, *model]
         if self.reads_perturbed:
@@ -447,9 +430,7 @@ class ActorCriticLoss(LossModule):
         if after:
             check_single_steps(batch, "the inverse dynamics model")
             following = next_states(batch.one_step, after, batch.done)
-            for key in after:
-                value = following.get(key)
-                inputs.set(nested("next", key), value.expand(len(inputs), *value.shape))
+            inputs.set("next", following.expand(*inputs.batch_size))
         return inputs
 
     def q(
@@ -576,11 +557,9 @@ class ActorCriticLoss(LossModule):
         ``terminated``, not ``done``: a time-out cuts the recording, not the task. The
         value :math:`V(s')` is ``[R]``.
         """
-        estimator = self.value_estimator
-        column(batch.rows, nested("next", self.tensor_keys.reward))
-        key = nested("next", estimator.tensor_keys.value)
-        own = batch.rows.copy().set(key, next_value.unsqueeze(-1))
-        target: Tensor = estimator.value_estimate(own)
+        rows, after = batch.rows, next_value.unsqueeze(-1)
+        column(rows, nested("next", self.tensor_keys.reward))
+        target: Tensor = self.value_estimator.value_estimate(rows, next_value=after)
         return target.reshape(-1)
 
     def td_error(
@@ -595,13 +574,10 @@ class ActorCriticLoss(LossModule):
         error = error if batch.unmasked is None else error * batch.unmasked
         given = batch.tensordict
         given.set(self.tensor_keys.priority, error.reshape(given.batch_size))
-        distance: Tensor = distance_loss(
-            pred_value, target.expand_as(pred_value), self.loss_function
-        )
-        values = {"pred_value": pred_value, "target_value": target}
-        return distance.sum(0), {
-            name: self.mean(value, batch) for name, value in values.items()
-        }
+        wide = target.expand_as(pred_value)
+        distance: Tensor = distance_loss(pred_value, wide, self.loss_function)
+        found, wanted = (self.mean(each, batch) for each in (pred_value, target))
+        return distance.sum(0), {"pred_value": found, "target_value": wanted}
 
     def check_actions(self, batch: Transitions, shape: torch.Size) -> None:
         """Raise unless the data's actions fit; warn once if they leave the bounds."""
@@ -654,8 +630,7 @@ class ActorCriticLoss(LossModule):
         self, value: Tensor, batch: Transitions, valid: Tensor | None = None
     ) -> Tensor:
         """Return the detached mean of a metric ``[..., R]`` over rows that count."""
-        value = value.detach()
-        value = value.reshape(-1, value.shape[-1]).mean(0)
+        value = value.detach().reshape(-1, value.shape[-1]).mean(0)
         counted = batch.counted(valid)
         if counted is not None:
             value = torch.where(counted, value, torch.zeros_like(value))
@@ -663,12 +638,10 @@ class ActorCriticLoss(LossModule):
 
     def _weights(self, batch: Transitions) -> Tensor | None:
         """Return the rows' importance weights ``[R]``, if there and to be used."""
-        if not self.use_prioritized_weights:
-            return None
         given, key = batch.tensordict, self.tensor_keys.priority_weight
         # Not TorchRL's _maybe_get_priority_weight, which fails with a nested key.
         weights: Tensor | None = given.get(key, None)
-        if weights is None:
+        if weights is None or not self.use_prioritized_weights:
             return None
         if weights.shape not in (given.batch_size, (*given.batch_size, 1)):
             raise ValueError(

@@ -110,9 +110,8 @@ class CQLLoss(ActorCriticLoss):
 
     def cql_losses(self, batch: Transitions, policy: StatePolicy) -> Losses:
         """Return all losses of CQL(H), weighted, and their metrics."""
-        objective, log_prob = self.soft_policy_objective(
-            batch, policy, self.actor_states
-        )
+        states = self.actor_states
+        objective, log_prob = self.soft_policy_objective(batch, policy, states)
         losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         if self.has_cql:
             q_data, gap = self.conservative_gap(batch, policy)

@@ -121,11 +121,9 @@ class DiscreteOSRLoss(ActorCriticLoss):
         qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
         q_data = at_actions(qvalue, batch.a, pi, self.tensor_keys.action)
         sought = self.action_values(batch.states[SETS[states]], self.frozen_critics, pi)
-        objective = F.discrete_policy_value(pi.logits, sought, self.alpha)
+        objective = F.discrete_policy_value(pi.logits, sought, self.alpha).mean(0)
         log_prob, auto = -pi.entropy(), 0.98 * math.log(pi.logits.shape[-1])
-        losses, metrics = self.soft_actor_losses(
-            batch, objective.mean(0), log_prob, auto
-        )
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob, auto)
         if self.has_recovery:
             model = self.inverse_dynamics(batch, "both").logits
             check_num_actions("inverse_dynamics_network", model, pi.logits)

@@ -64,7 +64,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
             the scale shrinks to its floor.
         latent_weight: weight of a latent's divergence. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        use_prioritized_weights: multiply rows by ``"priority_weight"``, if there.
+        use_prioritized_weights: weigh rows by ``"priority_weight"``, if there.
             Default true.
 
     Examples:

@@ -104,8 +104,7 @@ class OSRVLoss(ActorCriticLoss):
         if recovery_target != "data" and inverse_dynamics_network is not None:
             self.register_model(inverse_dynamics_network)
         self.register_coefficient("recovery_weight", recovery_weight)
-        self.recovery_target = recovery_target
-        self.policy_values = policy_values
+        self.recovery_target, self.policy_values = recovery_target, policy_values
         self.num_random, self.temperature = num_random, temperature
         self.declare_soft_actor_critic("recovery_gap")
 

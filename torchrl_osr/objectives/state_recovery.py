@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
-from torchrl.modules import Delta, IndependentNormal, TanhDelta
+from torchrl.modules import Delta, IndependentNormal, TanhDelta, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
 from torchrl.objectives import LossModule
 
@@ -108,15 +108,13 @@ class StateRecoveryLoss(ActorCriticLoss):
         self.recovery_direction = recovery_direction
         self.action_reduction = action_reduction
         head, _ = head_of(actor_network)
-        self.is_normal = head is IndependentNormal
-        self.is_deterministic = head in (None, Delta, TanhDelta)  # without a density
-        if self.is_deterministic or self.is_normal:
-            own = squashing_bounds(actor_network)
-        else:
-            own = action_bounds(actor_network, "actor_network")
+        deterministic = head in (None, Delta, TanhDelta)  # without a density
+        if not deterministic and head is not IndependentNormal:
+            action_bounds(actor_network, "actor_network")  # or a TypeError
+        own = squashing_bounds(actor_network)
         self.metric = "recovery_kl"
         if recovery_target == "data":
-            self.metric = "recovery_error" if self.is_deterministic else "recovery_nll"
+            self.metric = "recovery_error" if deterministic else "recovery_nll"
             self.register_bounds(own)
         elif inverse_dynamics_network is None:
             raise ValueError(
@@ -142,9 +140,8 @@ class StateRecoveryLoss(ActorCriticLoss):
         return keys
 
     def losses(self, batch: Transitions) -> Losses:
-        states = state_keys(self.actor_network.in_keys)
-        mixed = batch.states_of(states, self.recovery_states)
         network, key = self.actor_network, self.tensor_keys.action
+        mixed = batch.states_of(state_keys(network.in_keys), self.recovery_states)
         pi = policy_at(network, self.actor_network_params, mixed, key)
         if self.recovery_target == "data":
             recovery = cloning_distance(pi, batch.a, key).mean(0)
@@ -160,15 +157,15 @@ class StateRecoveryLoss(ActorCriticLoss):
         """Return the recovery term (11) of a policy and a model, ``[D, R]``."""
         # Of equal widths, only the means are left in the divergence.
         scale = model.scale
-        if isinstance(pi, TanhDelta):
+        if isinstance(pi, TanhNormal):
+            loc, scale = pi.loc, pi.scale
+        elif isinstance(pi, TanhDelta):
             loc = pi.base_dist.param  # not its action, which may have saturated
-        elif self.is_deterministic or self.is_normal:
+        else:
             action = pi if isinstance(pi, Tensor) else pi.mean
             width = self.action_high - self.action_low
             # Clamped a little inside the bounds, where the slope is finite.
             loc = safeatanh_noeps(2 * (action - self.action_low) / width - 1)
-        else:
-            loc, scale = pi.loc, pi.scale
         check_num_actions("inverse_dynamics_network", model.loc, loc)
         return F.state_recovery(
             *(loc, scale, model.loc, model.scale),
@@ -282,11 +279,9 @@ def at_actions(
     They are one-hot ``[R, n]`` of any type if the distribution is of one-hot actions,
     or else integer indices ``[R]`` or ``[R, 1]``; a ValueError names others.
     """
-    rows = values.shape[-2]
-    if one_hot := isinstance(distribution, ONE_HOT):
-        expected: Any = [(rows, distribution.logits.shape[-1])]
-    else:
-        expected = [(rows,), (rows, 1)]
+    rows, number = values.shape[-2:]
+    one_hot = isinstance(distribution, ONE_HOT)
+    expected: Any = [(rows, number)] if one_hot else [(rows,), (rows, 1)]
     if action.shape not in expected or (not one_hot and action.is_floating_point()):
         raise ValueError(
             f"{key!r} has shape {tuple(action.shape)} and type {action.dtype}; the "

@@ -92,14 +92,14 @@ class Transitions:
                 mask = mask.reshape(-1).bool()
                 rows = rows.where(mask, torch.zeros_like(rows))
                 self.unmasked = self.counted(mask)
+        for prefix in ("next", keys.one_step):
+            for key in (nested(prefix, keys.done), nested(prefix, keys.terminated)):
+                if rows.get(key, None) is not None:
+                    rows.set(key, column(rows, key).bool().unsqueeze(-1))
         self.rows = self.one_step = rows
         if keys.one_step in rows.keys(include_nested=True):
             own = rows.exclude(keys.steps_to_next_obs)
             self.one_step = own.set("next", rows.get(keys.one_step))
-        for each in (self.rows, self.one_step):
-            for key in (nested("next", keys.done), nested("next", keys.terminated)):
-                if each.get(key, None) is not None:
-                    each.set(key, column(each, key).bool().unsqueeze(-1))
 
     def stack_states(self, keys: Sequence[NestedKey], *, perturbed: bool) -> None:
         """Stack the states that actor and critics read, see ``states``."""
@@ -113,20 +113,19 @@ class Transitions:
 
         An entry without a perturbed one is the same in both halves.
         """
-        clean = TensorDict(
-            {key: entry(self.rows, key) for key in keys}, self.rows.batch_size
-        )
+        rows = self.rows
+        clean = TensorDict({key: entry(rows, key) for key in keys}, rows.batch_size)
         if states == "clean":
             return clean.unsqueeze(0)
         perturbed, names = clean.copy(), [nested(self.keys.perturbed, k) for k in keys]
-        if all(self.rows.get(name, None) is None for name in names):
+        if all(rows.get(name, None) is None for name in names):
             there = sorted(map(str, self.tensordict.keys(True, True)))
             raise KeyError(
                 f"No perturbed state in the batch: expected one of {names}, the batch "
                 f"has {there}. Append StatePerturbation(std=...) to the replay buffer."
             )
         for key, name in zip(keys, names, strict=True):
-            value = self.rows.get(name, None)
+            value = rows.get(name, None)
             if value is not None:
                 perturbed.set(key, _same_shape(clean, key, name, value))
         halves = {"both": [clean, perturbed], "perturbed": [perturbed]}

@@ -86,12 +86,8 @@ def policy_from_loss(
     loc = getattr(observation_norm, "loc", 0.0)
     scale = getattr(observation_norm, "scale", 1.0)
     bounded = 0 if head == "OneHotCategorical" else size
-    for name, given, length in (
-        ("loc", loc, inputs),
-        ("scale", scale, inputs),
-        ("low", low, bounded),
-        ("high", high, bounded),
-    ):
+    for name, given in {"loc": loc, "scale": scale, "low": low, "high": high}.items():
+        length = bounded if name in ("low", "high") else inputs
         tensors[name] = torch.as_tensor(given).cpu().float().expand(length).clone()
     width = tensors["high"] - tensors["low"]
     if not (width > 0).all() or width.isinf().any():

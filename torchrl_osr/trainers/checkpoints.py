@@ -158,10 +158,7 @@ class Checkpoints:
         the next: a continued run ends up with the files of an undisturbed one.
         """
         found = self._found()
-        regular = [
-            path for path in found
-            if int(path.stem.rpartition("-")[2]) % self.interval == 0
-        ]  # fmt: skip
+        regular = [x for x in found if int(x.stem.split("-")[1]) % self.interval == 0]
         for path in set(found) - {*regular[::-1][: self.kept], *found[-1:]}:
             path.unlink()
 

@@ -111,11 +111,10 @@ class OfflineTrainer(Trainer):
         description: str = "train",
         progress: bool = True,
     ) -> None:
+        own = [] if evaluation is None else [evaluation.interval]
         if checkpoint_interval is None:
-            checkpoint_interval = evaluation.interval if evaluation else 5000
-        intervals = [log_interval, checkpoint_interval]
-        if evaluation is not None:
-            intervals.append(evaluation.interval)
+            checkpoint_interval = own[0] if own else 5000
+        intervals = [log_interval, checkpoint_interval, *own]
         super().__init__(
             collector=_StepCounter(total_steps, intervals),
             total_frames=total_steps,
@@ -182,12 +181,11 @@ class OfflineTrainer(Trainer):
         """
         if self.evaluation is None:
             return None
-        name, choose = self.evaluation.metric, {"max": max, "min": min}
+        name = self.evaluation.metric
+        choose = {"max": max, "min": min}[self.evaluation.best]
         rows = [row for row in self.history if row[name] is not None]
         rows = [row for row in rows if row["step"]] or rows
-        return choose[self.evaluation.best](
-            rows, key=lambda row: row[name], default=None
-        )
+        return choose(rows, key=lambda row: row[name], default=None)
 
     def train(self) -> None:
         """Run, or continue, to the last step; a finished run returns at once."""
@@ -282,10 +280,9 @@ class OfflineTrainer(Trainer):
         self._bar.update(self.collected_frames - self._bar.n)
 
     def _log_numbers(self, numbers: Mapping[str, float]) -> None:
+        named = {f"{self.description}/{name}": each for name, each in numbers.items()}
         for logger in self.loggers:
-            for name, value in numbers.items():
-                name = f"{self.description}/{name}"
-                logger.log_scalar(name, value, step=self.collected_frames)
+            logger.log_metrics(named, step=self.collected_frames)
 
     def _is_evaluated(self) -> bool:
         steps = [row["step"] for row in self.history]
@@ -314,13 +311,10 @@ class OfflineTrainer(Trainer):
         self._bar.set_postfix_str(f"{evaluation.metric} {text}")
         if self.best() is results:
             metadata = {"step": step, evaluation.metric: metric}
-            self.checkpoints.write(
-                self.checkpoints.best_path, components=self._model, metadata=metadata
-            )
-        numbers = {
-            name: value for name, value in results.items()
-            if isinstance(value, (int, float)) and name != "step"
-        }  # fmt: skip
+            path = self.checkpoints.best_path
+            self.checkpoints.write(path, components=self._model, metadata=metadata)
+        numbers = {k: v for k, v in results.items() if isinstance(v, (int, float))}
+        del numbers["step"]
         self._log_numbers(numbers)
         if step and step == self._saved["step"]:
             self.checkpoints.save(step)  # once more, with the result

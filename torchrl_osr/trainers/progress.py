@@ -35,8 +35,7 @@ def progress_bar(
     what: str, total: int, *, first: int = 0, unit: str = "step", bar: bool = True
 ) -> Iterator[Any]:
     """Open tqdm's bar at a step; without a terminal it logs every half minute."""
-    options: dict[str, Any] = {"desc": what, "total": total, "unit": unit}
-    options["initial"] = first
+    options: Any = {"desc": what, "total": total, "unit": unit, "initial": first}
     if bar and sys.stderr.isatty():
         with logging_redirect_tqdm(), tqdm(**options) as shown:
             yield shown

@@ -57,9 +57,10 @@ def test_a_file_that_deviates_is_reported(tmp_path):
     policy, path = load_run_policy(tmp_path / "run"), tmp_path / "p.safetensors"
     policy.save(path)
     assert export.check(policy, path, "action") == 0
-    policy.actor[-1].bias += 0.1
-    with pytest.raises(ValueError, match="was written, but deviates from the policy"):
-        export.check(policy, path, "action")
+    for change in (0.1, np.nan):
+        policy.actor[-1].bias += change
+        with pytest.raises(ValueError, match="written, but deviates from the policy"):
+            export.check(policy, path, "action")
 
 
 def test_what_cannot_be_exported_is_one_line(tmp_path, run):

@@ -92,6 +92,7 @@ def with_truncated(table):
         (without_success, {"terminated": "next.done"}, 5),
         (with_truncated, {}, 1),
         (with_truncated, {"terminated": "next.success"}, 2),
+        (lambda table: table.assign(cut=table["index"] > 9), {"truncated": "cut"}, 1),
         (lambda table: table, {"reward": "timestamp"}, 2),
     ],
 )

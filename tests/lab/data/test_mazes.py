@@ -14,7 +14,8 @@ from torchrl_osr.lab.data.mazes import point_sampler, shortest_path, turned
 
 
 def test_the_controller_by_hand():
-    with closing(make_environment("PointMaze_UMaze-v3")) as env:
+    with closing(make_environment("gymnasium_robotics:PointMaze_UMaze-v3")) as env:
+        assert not env.unwrapped.continuing_task  # however its id is written
         sample = point_sampler(env.unwrapped.maze)
 
     class Silent:

@@ -46,6 +46,8 @@ def test_keys_that_were_added_are_refused(key):
         ("data.held_out", float("nan"), "data.held_out must be between 0 and 1"),
         ("optim.tau", 5.0, "optim.tau must be between 0 and 1, got 5"),
         ("logger.kind", "tape", "logger.kind must be one of .*'csv', .*, got 'tape'"),
+        ("seed", "${by_data:loss.x}", "has an interpolation: no run"),
+        ("env.id", r"\${oc.create:{_target_:os.system}}", "an interpolation: no run"),
         ("format", 1, r"another version of torchrl-osr \(format 1, this one reads 2"),
     ],
 )

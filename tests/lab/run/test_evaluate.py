@@ -40,8 +40,12 @@ def test_a_switching_policy_is_played_from_minus_1_to_1():
     assert policy(torch.tensor([[0.0], [0.5]])).tolist() == [[-1], [0]]
 
 
-def test_results_are_kept_with_what_decides_them(folder, capsys):
+def test_results_are_kept_with_what_decides_them(folder, capsys, monkeypatch):
     given = folder, "suite=start", "last=2"
+    monkeypatch.setattr("os.access", lambda path, mode: path != folder)
+    with pytest.raises(PermissionError, match="is read-only: work on a copy of it"):
+        play(*given)
+    monkeypatch.undo()
     results = play(*given)
     names = list(evaluating("suite=start").suite.disturbances)
     assert (results["env"], results["data"]) == ("hopper", "random")

@@ -20,6 +20,12 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     given = "loss=td3_bc", "data.action_bounds=[-1,3]"
     with pytest.raises(ValueError, match=r"'act' holds other than numbers"):
         fit(frame.assign(act="left"), folder, *small, *given)
+    (folder / "policy.safetensors").touch()
+    with pytest.raises(FileExistsError, match="has a policy of no run: move it away"):
+        fit(frame, folder, *small, *given)
+    (folder / "policy.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"reward.*data\.missing"):
+        fit({**frame, "reward": [None, *frame["reward"][1:]]}, folder, *small, *given)
     policy = fit(frame, folder, *small, *given)
     assert policy.act(np.zeros(2)).shape == (1,)
     assert (policy.low, policy.high) == (-1, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import shlex
 import signal
@@ -53,11 +52,8 @@ def main(cfg: DictConfig) -> None:
         return
     else:
         path, results = evaluate_run(config)
-    if config.suite.half is None:
-        print("\n" + disturbance_table(results))
-    else:
-        print("\n" + recoverable_table(results))
-    print(f"  files  {path}")
+    table = disturbance_table if config.suite.half is None else recoverable_table
+    print(f"\n{table(results)}\n  files  {path}")
 
 
 def finished_runs(sweep: str) -> list[Path]:
@@ -78,15 +74,13 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
     runs = finished_runs(str(config.sweep))
     failed = []
     # Spawned: torch's threads do not survive a fork. Ctrl-C ends them in silence.
-    workers = ProcessPoolExecutor(
-        min(config.jobs, len(runs)),
-        multiprocessing.get_context("spawn"),
-        functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
-    )
+    spawn = multiprocessing.get_context("spawn")
+    ends = signal.SIGINT, signal.SIG_DFL
+    pool = ProcessPoolExecutor(min(config.jobs, len(runs)), spawn, signal.signal, ends)
     jobs = {}
     for run in runs:
         one = replace(config, checkpoint=str(run), progress=False)
-        jobs[workers.submit(evaluate_run, one)] = run
+        jobs[pool.submit(evaluate_run, one)] = run
     try:
         for number, job in enumerate(as_completed(jobs), start=1):
             try:
@@ -96,7 +90,7 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
                 outcome = f"failed: {sentence(error)}"
             print(f"{number} of {len(runs)}: {jobs[job]}: {outcome}", flush=True)
     finally:
-        workers.shutdown(cancel_futures=True)
+        pool.shutdown(cancel_futures=True)
     if failed:
         raise ValueError(
             f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}."

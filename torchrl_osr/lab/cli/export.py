@@ -61,21 +61,21 @@ def main() -> None:
         OmegaConf.set_struct(known, True)
         given: Any = OmegaConf.merge(known, OmegaConf.from_dotlist(options.settings))
         monitor: Any = OmegaConf.to_object(given.monitor)
-        policy.attach(
-            monitor_of_run(options.source, monitor, given.data.path, options.trust)
-        )
+        place, trust = given.data.path, options.trust
+        policy.attach(monitor_of_run(options.source, monitor, place, trust))
+    beside = options.path.with_stem(f".{options.path.stem}.new")
     if options.path.suffix == SUFFIX:
-        policy.save(options.path)
+        policy.save(beside)
     else:
-        policy.export(options.path, options.output)
-    deviation = check(policy, options.path, options.output)
+        policy.export(beside, options.output)
+    deviation = check(policy, beside, options.output)
+    beside.replace(options.path)  # an earlier file is kept until this one is checked
     origin = {"env_id": "?", "step": "?"} | policy.record["source"]
     alarm = "with a monitor" if policy.data_monitor is not None else "without a monitor"
     print(
-        f"{options.path}: {options.path.stat().st_size:,} bytes, "
-        "{loss}, {env_id}, step {step}, ".format(**origin)
-        + f"{alarm}\n"
-        + f"largest deviation on {ROWS} observations: {deviation:.1e}"
+        f"{options.path}: {options.path.stat().st_size:,} bytes, {origin['loss']}, "
+        f"{origin['env_id']}, step {origin['step']}, {alarm}\n"
+        f"largest deviation on {ROWS} observations: {deviation:.1e}"
     )
 
 
@@ -87,12 +87,12 @@ def check(policy: Policy, path: Path, output: str) -> float:
     inputs = {"observation": observation}
     if output == "value":
         inputs["action"] = policy.act(observation)
-    largest = 0.0
+    deviations: list[Tensor] = []
     found, wanted = read(path, output, inputs), outputs_of(policy, output, inputs)
     for one, other in zip(found, wanted, strict=True):
-        size = other.float().abs().clamp(1)
-        deviation = (one.float() - other.float()).abs() / size  # alarms are bool
-        largest = max(largest, deviation.max().item())
+        size = other.float().abs().clamp(1)  # alarms are bool
+        deviations.append(((one.float() - other.float()).abs() / size).max())
+    largest = torch.stack(deviations).max().item()  # NaN, which max() would pass
     if not largest <= TOLERANCE:
         raise ValueError(
             f"{path} was written, but deviates from the policy by {largest:.1e}, more "

@@ -92,11 +92,9 @@ def convert(
     found: list[str] = []
     if options.action_bounds == "log":
         parts = [*parts]
-        options = replace(options, action_bounds=_range(part for _, part in parts))
-        low, high = (
-            "[" + ", ".join(f"{x:.4g}" for x in each) + "]"
-            for each in options.action_bounds
-        )
+        bounds = _range(part for _, part in parts)
+        options = replace(options, action_bounds=bounds)
+        low, high = (f"[{', '.join(f'{x:.4g}' for x in each)}]" for each in bounds)
         found.append(
             f"The bounds of the actions are {low} and {high}, the range of the log and "
             f"{MARGIN:.0%} on either side: data.action_bounds=[low,high] sets others."
@@ -118,8 +116,7 @@ def convert(
     returns, lengths, complete = np.concatenate(episodes).T
     whole, lengths = complete == 1, lengths.astype(int)
     warnings = [*about.get("warnings", []), *dict.fromkeys(found)]
-    told = [name for name in WARNINGS if counts[name]]
-    warnings += [f"{counts[name]:,} rows {WARNINGS[name]}." for name in told]
+    warnings += [f"{counts[n]:,} rows {s}." for n, s in WARNINGS.items() if counts[n]]
     for warning in warnings:
         torchrl_logger.warning(warning)
     bounds = [np.asarray(b, np.float64).tolist() for b in options.action_bounds]
@@ -417,10 +414,9 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
             "(env.id=...), give their number (env=none env.action_size=...), or the "
             "bounds of forces (data.action_bounds=[0,high])."
         )
-    unit = action
     # Bounds of -1 and 1 leave the numbers as they are, bit by bit.
-    if np.any(low != -1) or np.any(high != 1):
-        unit = (action.astype(np.float64) - low) / (high - low) * 2 - 1
+    same = (low == -1).all() and (high == 1).all()
+    unit = action if same else (action - low) / (high - low) * 2 - 1
     unit = unit.astype(np.float32)
     outside = (np.abs(unit) > 1 + ROUNDING).any(1)
     if outside.any() and not options.clip_actions:

@@ -158,10 +158,6 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
     """Make the task as it is registered, with clear errors."""
 
     def make() -> gymnasium.Env[Any, Any]:
-        spec = gymnasium.registry.get(env_id)
-        # Without it an episode never ends at the goal, and the return is no success.
-        maze = spec is not None and "maze_map" in spec.kwargs
-        options = {"continuing_task": False} if maze else {}
         # Without a handler MuJoCo appends its notes on deprecated model attributes to
         # MUJOCO_LOG.TXT in the working folder. Warnings while stepping are left alone.
         handler = mujoco.get_mju_user_warning()
@@ -170,7 +166,7 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
             with warnings.catch_warnings():
                 old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
                 warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
-                return gymnasium.make(env_id, **options)
+                return gymnasium.make(env_id)
         finally:
             mujoco.set_mju_user_warning(handler)
 
@@ -195,6 +191,8 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
             "env.id=<package>:<name>, where that can be imported."
         ) from error
     if env.spec is not None and "maze_map" in env.spec.kwargs:
+        # Else an episode never ends at the goal, and the return is no success.
+        env.set_wrapper_attr("continuing_task", False)
         # The model's file, which is loaded now and would be left for ever.
         Path(env.get_wrapper_attr("tmp_xml_file_path")).unlink(missing_ok=True)
     return env

@@ -48,7 +48,7 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
         for part, names in KNOWN_NAMES.items()
         if (there := [name for name in names if name in features])
     }
-    by_truncated = "truncated" in known and "terminated" not in columns
+    by_truncated = "truncated" in {**known, **columns} and "terminated" not in columns
     if by_truncated:
         known["terminated"] = False
     about: dict[str, Any] = {"source": "lerobot", "path": str(folder)}

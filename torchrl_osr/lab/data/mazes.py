@@ -56,12 +56,10 @@ def maze_sources(env_name: str) -> dict[str, list[tuple[Cell, Cell]] | None]:
 
     Both are moved within their cells.
     """
-    body, size = env_name.split("-")
-    if size != "umaze":
-        return {"diverse": None, "play": PLAY_CELLS[size]}
-    return {"diverse": None} | (
-        {"umaze": [TEST_CELLS[size]]} if body == "antmaze" else {}
-    )
+    if env_name == "antmaze-umaze":
+        return {"diverse": None, "umaze": [TEST_CELLS["umaze"]]}
+    play = PLAY_CELLS.get(env_name.split("-")[1])
+    return {"diverse": None} | ({"play": play} if play else {})
 
 
 def maze_behavior(env_name: str, source: str) -> dict[str, Any]:

@@ -97,9 +97,8 @@ def _read(
 def _flattened(space: Any, observations: Any) -> Any:
     """Return rows ``[T + 1, S]`` of observations, in the order of their space."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        parted: Any = space
-        keys = parted if isinstance(space, spaces.Dict) else range(len(space))
-        parts = [_flattened(parted[key], observations[key]) for key in keys]
+        keys: Any = space if isinstance(space, spaces.Dict) else range(len(space))
+        parts = [_flattened(space[key], observations[key]) for key in keys]
         return np.concatenate(parts, axis=1)
     array = np.asarray(observations)
     if isinstance(space, spaces.Box):

@@ -108,8 +108,8 @@ def check_log_path(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
 
 
-def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+def write_log(path: Path, columns: Mapping[str, Any]) -> None:
     """Write columns to a file, whole or not at all; missing folders are made."""
     check_log_path(path)
     with whole_file(path) as file:
-        np.savez(file, allow_pickle=False, **columns)
+        np.savez(file, **columns)

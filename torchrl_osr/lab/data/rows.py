@@ -27,9 +27,8 @@ def split_held_out(
             "expected at least one row on each side, as with data.held_out=0.2."
         )
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
-    mask = torch.zeros(rows, dtype=torch.bool)
-    mask[order[:count]] = True
-    return data[~mask], data[mask]
+    held, kept = torch.split(order, [count, rows - count])
+    return data[kept.sort().values], data[held.sort().values]
 
 
 def mix_datasets(

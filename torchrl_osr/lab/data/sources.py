@@ -175,12 +175,10 @@ def rolled_out(
     }
 
     def collect() -> Dataset:
-        data, returns, lengths = collect_source(
-            env_name, source, rows, seed=seed, progress=progress
-        )
-        about = {"torchrl_osr_version": __version__}
-        about |= {"episode_returns": returns.tolist()}
-        return data, about | {"episode_lengths": lengths.tolist()}
+        data, *episodes = collect_source(env_name, source, **recipe, progress=progress)
+        returns, lengths = (each.tolist() for each in episodes)
+        about = {"torchrl_osr_version": __version__, "episode_returns": returns}
+        return data, about | {"episode_lengths": lengths}
 
     name = f"{env_name}-{source}-{rows}-seed{seed}.safetensors"
     return load_or_write(cache_root() / "collected" / name, request, collect)
@@ -228,9 +226,8 @@ def _check_fit(
 ) -> None:
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
-    numbered = manifest["num_actions"] is not None
     fits = ours == [spec.observation_size, spec.action_size]
-    if not fits or numbered != spec.discrete:
+    if not fits or (manifest["num_actions"] is not None) != spec.discrete:
         kind = "discrete" if spec.discrete else "continuous"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "

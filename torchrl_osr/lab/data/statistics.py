@@ -15,6 +15,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl import torchrl_logger
 
+from torchrl_osr.lab.data.environment import MAZE_IDS
+
 # A constant observation entry would otherwise be divided by zero, and one that barely
 # moves would drown the others. TD3+BC adds 1e-3 to the standard deviation; as a floor
 # it leaves all larger entries exactly unit-variance.
@@ -53,11 +55,7 @@ REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
     "hopper": ReferenceReturns(random=-20.272305, expert=3234.3),
     "halfcheetah": ReferenceReturns(random=-280.178953, expert=12135.0),
     "walker2d": ReferenceReturns(random=1.629008, expert=4592.3),
-} | {
-    f"{body}maze-{size}": ReferenceReturns(random=0.0, expert=1.0)
-    for body in ("point", "ant")
-    for size in ("umaze", "medium", "large")
-}
+} | dict.fromkeys(MAZE_IDS, ReferenceReturns(random=0.0, expert=1.0))
 """D4RL's reference returns by short environment name."""
 
 

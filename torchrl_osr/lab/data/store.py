@@ -14,7 +14,7 @@ from filelock import FileLock
 from platformdirs import user_cache_dir
 from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_osr._files import read_tensors, write_tensors
 from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_dataset
@@ -81,10 +81,8 @@ def make_replay_buffer(
     does not prefetch, because threads would make the order of the draws depend on time.
     """
     device = torch.device(device or data.device or "cpu")
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(len(data), device=device),
+    return ReplayBuffer(
+        storage=TensorStorage(data.to(device), device=device),
         batch_size=batch_size,
         generator=torch.Generator(device).manual_seed(seed),
     )
-    buffer.extend(data.to(device))
-    return buffer

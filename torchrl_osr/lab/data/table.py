@@ -82,11 +82,10 @@ def log_parts(
         about.update(known)
         if "columns" not in about:
             about["columns"] = find_columns(names, columns)
-            used = {*chain(*about["columns"].values())}
-            about["unused_columns"] = [name for name in names if name not in used]
             if not has_rewards(about):
                 about.setdefault("warnings", []).append(NO_REWARDS)
         needed = [*chain(*about["columns"].values())]
+        about.setdefault("unused_columns", [n for n in names if n not in needed])
         if lacking := {*needed} - {*names}:
             raise ValueError(f"it lacks {sorted(lacking)}, which other files have.")
         return needed

@@ -28,13 +28,12 @@ Array = NDArray[Any]
 
 def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
     """Return transitions ``[N]`` from arrays by name, which are not copied."""
-    size = [len(columns["reward"])]
     tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
     after = {n: tensors[n][:, None] for n in ("reward", "terminated", "truncated")}
     after["done"] = after["terminated"] | after["truncated"]
     after["observation"] = tensors["next_observation"]
     rows = {name: tensors[name] for name in ("observation", "action")}
-    return TensorDict(rows | {"next": TensorDict(after, size)}, size)
+    return TensorDict(rows | {"next": after}, [len(columns["reward"])])
 
 
 def check_dataset(data: TensorDictBase) -> None:

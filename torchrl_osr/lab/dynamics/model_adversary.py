@@ -57,7 +57,7 @@ class ModelAdversary:
         self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
 
     def __call__(self, number: int) -> None:
-        """Train the model with the seed of this number; torch's generator stays."""
+        """Train the model; the buffer's generator draws rows, the number the rest."""
         options, device = self.options, self.model.elites.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(SEED + (self.data.seed << 20) + number)

@@ -267,10 +267,8 @@ class DynamicsLoss(ActorCriticLoss):
                 f"{len(rows)} rows cannot be divided among {number} networks."
             )
         with self.dynamics_network_params.to_module(model):
-            inputs, targets = model.inputs_and_targets(rows)
+            inputs, targets = model.inputs_and_targets(rows.reshape(number, -1))
             targets = (targets - model.target_loc) / model.target_scale
-            inputs = inputs.reshape(number, -1, inputs.shape[-1])
-            targets = targets.reshape(number, -1, targets.shape[-1])
             mean, log_variance = model.predict_standardized(inputs)
             width = model.highest_log_variance - model.lowest_log_variance
             bounds = BOUND_WEIGHT * width.sum()

@@ -33,10 +33,7 @@ class ModelData:
     def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
         """Return a buffer of the rows to train on, without transforms."""
         return ReplayBuffer(
-            storage=self.storage,
-            writer=ImmutableDatasetWriter(),
-            collate_fn=lambda batch: batch,
-            batch_size=batch_size,
+            storage=self.storage, writer=ImmutableDatasetWriter(), batch_size=batch_size
         )
 
 

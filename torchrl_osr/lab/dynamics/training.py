@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
+from torchrl.data import TensorStorage
 
 from torchrl_osr._files import read_tensors, write_json, write_tensors
-from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.lab.dynamics.body import Body, fitted_body
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (
@@ -57,9 +57,11 @@ def train_dynamics(
     parts = [each for each in loss.modules() if isinstance(each, ActorCriticLoss)]
     for each in parts:
         if hasattr(each, "dynamics_network"):
-            each.load_frozen("dynamics_network", model)
+            each.from_stateful_net("dynamics_network", model)
         if hasattr(each, "transition_network"):
-            each.load_frozen("transition_network", _trained_vae(options, data, fit))
+            each.from_stateful_net(
+                "transition_network", _trained_vae(options, data, fit)
+            )
     if options.real_ratio == 1:
         return None
     adversary = None
@@ -140,14 +142,12 @@ def _with_body(
     model: DynamicsEnsemble, options: DynamicsOptions, data: ModelData
 ) -> ModelData:
     """Give a model its body; return rows with what the body predicts."""
-    loc, scale = data.loc.tolist(), data.scale.tolist()
     bounds = {"low": data.action_low, "high": data.action_high}
-    body = options.body(loc=loc, scale=scale, **bounds)
+    body = options.body(loc=data.loc.tolist(), scale=data.scale.tolist(), **bounds)
     rows = data.storage[:].select("observation", "action", "next")
     model.body, rows = fitted_body(body, rows, seed=data.seed)
     device = data.held_out.device or "cpu"
-    buffer = make_replay_buffer(rows, batch_size=1, seed=0, device=device)
-    return replace(data, storage=buffer.storage)
+    return replace(data, storage=TensorStorage(rows.to(device), device=device))
 
 
 def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> None:

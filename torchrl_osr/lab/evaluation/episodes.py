@@ -104,9 +104,8 @@ class EpisodeEvaluator:
         fixed_batch: bool = False,
     ) -> None:
         check_positive("num_episodes", num_episodes, minimum=1)
-        self.environments = [make_environment(env_id) for _ in range(num_episodes)]
-        if wrap is not None:
-            self.environments = [wrap(each) for each in self.environments]
+        made = (make_environment(env_id) for _ in range(num_episodes))
+        self.environments = [each if wrap is None else wrap(each) for each in made]
         self.seeds = seed + np.arange(num_episodes)
         self.device, self.fixed_batch = device, fixed_batch
 

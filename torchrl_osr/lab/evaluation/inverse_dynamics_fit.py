@@ -34,9 +34,7 @@ def inverse_dynamics_report(
         )
     # Latent variables at their mean, as the policy's losses use the model.
     with set_interaction_type(InteractionType.DETERMINISTIC):
-        distribution = inverse_dynamics_network.get_dist(
-            data.select(*inverse_dynamics_network.in_keys)
-        )
+        distribution = inverse_dynamics_network.get_dist(data)
     action = data.get("action")
     report = {"nll": -distribution.log_prob(action).mean().item(), "rows": len(data)}
     if isinstance(distribution, ONE_HOT):

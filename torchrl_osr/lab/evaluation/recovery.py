@@ -46,12 +46,10 @@ class DataDistance:
         loc, scale = observation_statistics(data)
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         order = torch.randperm(len(data), generator=torch.Generator().manual_seed(seed))
-        states, others = (
-            data[rows]["observation"].cpu()
-            for rows in (order[held_out:][:MAX_REFERENCE], order[:held_out])
-        )
-        self._states = self._standard(states)
-        self.threshold = float(torch.quantile(self(others).double(), 0.95))
+        states = data["observation"].cpu()
+        self._states = self._standard(states[order[held_out:][:MAX_REFERENCE]])
+        others = self(states[order[:held_out]]).double()
+        self.threshold = float(torch.quantile(others, 0.95))
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return the distances of raw observations ``[M, S]``, float32 ``[M]``."""

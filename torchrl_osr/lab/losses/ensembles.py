@@ -93,13 +93,11 @@ class EDACLoss(ActorCriticLoss):
     def gradients_and_values(self, batch: Transitions) -> tuple[Tensor, Tensor]:
         """Return each critic's gradient by the data's action, and value, ``[N, R]``."""
         number, keys = self.num_qvalue_nets, self.tensor_keys
-        states = batch.s.select(*state_keys(self.qvalue_network.in_keys), strict=False)
+        network, params = self.qvalue_network, self.qvalue_network_params
+        states = batch.s.select(*state_keys(network.in_keys), strict=False)
         states = states.expand(number, *states.batch_size)
-        params = self.qvalue_network_params
         # Each critic at actions of its own, for its own gradient.
-        critics = _vmap_func(
-            self.qvalue_network, (0, 0), pseudo_vmap=self.deactivate_vmap
-        )
+        critics = _vmap_func(network, (0, 0), pseudo_vmap=self.deactivate_vmap)
 
         def total(action: Tensor) -> tuple[Tensor, Tensor]:
             rows = critics(states.copy().set(keys.action, action), params)

@@ -161,15 +161,15 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         if each.estimate and each.verdict in ("better", "worse"):
             sentences.append(
                 f"{each.method} is {each.verdict} than {reference} in "
-                f"{each.quantity.name} on {each.data}: "
-                f"{each.estimate:+}, "
+                f"{each.quantity.name} on {each.data}: {each.estimate:+}, "
                 f"{each.seeds} pairs of runs a data set."
             )
         else:
             rest.setdefault((each.quantity.name, each.verdict), []).append(each.method)
     for (name, why), methods in rest.items():
         who = ", ".join(dict.fromkeys(methods))
-        sentences.append(f"{name.capitalize()}, {why}: {who} against {reference}.")
+        name = name[0].upper() + name[1:]
+        sentences.append(f"{name}, {why}: {who} against {reference}.")
     return sentences or [f"There is nothing to compare with {reference}."]
 
 

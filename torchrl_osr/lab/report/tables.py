@@ -23,7 +23,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     scores_and_decreases,
 )
 from torchrl_osr.lab.evaluation.tables import NUM_RECENT
-from torchrl_osr.lab.report.runs import RunTables
+from torchrl_osr.lab.report.runs import SAVED, RunTables
 
 
 def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
@@ -114,9 +114,7 @@ def recovery_table(saved: pd.DataFrame, reference: str = "") -> pd.DataFrame:
     for (data, states), rows in saved.groupby(["data", "states"], sort=False):
         rows = rows.assign(state=rows.groupby("run").cumcount())
         of_each = rows.drop_duplicates("state")  # they have the same order in each run
-        group, disturbance, walk = (
-            of_each[name].to_numpy() for name in ("group", "disturbance", "walk")
-        )
+        group, disturbance, walk = (of_each[name].to_numpy() for name in SAVED[1:-1])
         keys = ["run", "method", "seed"]  # sorted by run: resamples draw in this order
         back = rows.pivot(index=keys, columns="state", values="back").droplevel("run")
         hard = group == GROUPS[-1]

@@ -44,11 +44,10 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     The configuration is checked and has the sizes of its environment. A ValueError
     names options that do not fit each other or the environment.
     """
-    env, cells = config.env, list(config.network.num_cells)
+    env, network, cells = config.env, config.network, config.network.num_cells
     sizes: Any = env.observation_size, env.action_size
-    layer_norm = config.network.layer_norm
-    layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
-    actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
+    layers: dict[str, Any] = {"num_cells": cells, "layer_norm": network.layer_norm}
+    actor = instantiate(network.actor, *sizes, num_cells=cells).to(device)
     kind, name = ("discrete", "discrete_osr") if env.discrete else ("continuous", "osr")
     if is_categorical(actor) != env.discrete:
         raise ValueError(
@@ -56,9 +55,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
             f"is for others: choose loss={name}, for example."
         )
     number = config.loss.get("num_qvalue_nets", 2)
-    critics = instantiate(
-        config.network.critic, *sizes, num_qvalue_nets=number, **layers
-    )
+    critics = instantiate(network.critic, *sizes, num_qvalue_nets=number, **layers)
     model = instantiate(config.inverse_dynamics.network, *sizes, num_cells=cells)
     model.to(device)
     vae_cells = config.dynamics.vae_num_cells

@@ -94,8 +94,9 @@ def read_run(folder: Path, trust: Sequence[str] = ()) -> TrainConfig:
 def read_config(folder: Path) -> dict[str, Any]:
     """Read the configuration in the folder of a run; refuse that of another version."""
     content = read_yaml(folder / CONFIG)
-    found = content.pop("format", 1)
-    if found != FORMAT:
+    if "${" in str(content):  # resolving it could import or call anything
+        raise ValueError(f"{folder / CONFIG} has an interpolation: no run writes one.")
+    if (found := content.pop("format", 1)) != FORMAT:
         raise ValueError(
             f"{folder} holds a run of another version of torchrl-osr (format {found}, "
             f"this one reads {FORMAT}): use that version, or train again."
@@ -109,6 +110,7 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     # Of one start alone, and what is already applied.
     for key in ("resume", "force", "trust", "settings"):
         del content[key]
+    content["data"]["download"] = False
     write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
 
 
@@ -124,9 +126,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise ValueError("it holds no mapping")
     except (yaml.YAMLError, ValueError) as error:
-        raise ValueError(
-            f"{path} is damaged: {' '.join(str(error).split())}"
-        ) from error
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path} is damaged: {text}") from error
     return content
 
 
@@ -162,8 +163,7 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
 
 def check_environment(env_id: str | None, trust: Sequence[str] = ()) -> None:
     """Refuse an id as ``"module:Name-v0"``, which Gymnasium imports, without trust."""
-    module = (env_id or "").rpartition(":")[0]
-    if module and module not in trust:
+    if (module := (env_id or "").rpartition(":")[0]) not in ("", *trust):
         raise ValueError(
             f"env.id={env_id} imports a module: allow it with trust=[{module}] if you "
             "know it."

@@ -128,9 +128,7 @@ def load_training_data(
     rows, held_out = split_held_out(rows, options.held_out, seed=options.seed)
     size = config.trainer.batch_size
     buffer = make_replay_buffer(rows, batch_size=size, seed=0, device=device)
-    mean = manifest["normalized_score"]
-    if references_of(env) is None:
-        mean = manifest["mean_return"]
+    mean = manifest["mean_return" if references_of(env) is None else "normalized_score"]
     largest = reward.abs().max().item()
     return TrainingData(
         buffer, held_out.to(device), norm(*states).to(device), largest, mean

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl import torchrl_logger
 
-from torchrl_osr._files import read_json, sha256_of, write_json
+from torchrl_osr._files import check_writable, read_json, sha256_of, write_json
 from torchrl_osr.lab.data import observation_statistics
 from torchrl_osr.lab.data.environment import known_ids
 from torchrl_osr.lab.dynamics import SwitchingPolicy
@@ -88,6 +88,7 @@ def evaluate_files(
             )
         print(f"{path} is there already; force=true repeats it.")
     else:
+        check_writable(path.parent)
         play = play_suite if config.suite.half is None else play_states
         results = request | play(config, players_of(config, files))
         write_json(path, results)
@@ -145,17 +146,13 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     plays = len(players) * (1 + len(suite))  # the clean episodes first
     shown = progress_bar(config.suite.name, plays, unit="play", bar=config.progress)
     evaluations = []
+    play = partial(
+        evaluate_paired, num_episodes=config.episodes, references=references_of(run.env)
+    )
     with shown as bar:
-        options: dict[str, Any] = {
-            "num_episodes": config.episodes,
-            "references": references_of(run.env),
-            "advance": bar.update,
-        }
-        for number, (trained, policy) in enumerate(players):
-            seed = config.seed + SEED_STRIDE * number
-            paired = evaluate_paired(
-                policy, str(run.env.id), suite, distance, seed=seed, **options
-            )
+        for n, (trained, policy) in enumerate(players):
+            options = {"seed": config.seed + SEED_STRIDE * n, "advance": bar.update}
+            paired = play(policy, str(run.env.id), suite, distance, **options)
             evaluations.append({"step": trained.step} | paired)
     return {
         "env": run.env.name,

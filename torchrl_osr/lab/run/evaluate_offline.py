@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torchrl import torchrl_logger
 
-from torchrl_osr._files import read_json, sha256_of, write_json
+from torchrl_osr._files import check_writable, read_json, sha256_of, write_json
 from torchrl_osr.lab.data.columns import NO_REWARDS, has_rewards
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import deterministic_policy, fitted_values
@@ -76,6 +76,7 @@ class OfflineEvaluator:
         file = run_folder_of(path) / "-".join([*parts, OFFLINE])
         if file.exists() and request.items() <= (known := read_json(file)).items():
             return known
+        check_writable(file.parent)
         key = repr((env, options))  # one file may be read in several ways
         if key not in self._known:
             self._known = {key: load_data(env, options)}
@@ -96,7 +97,6 @@ class OfflineEvaluator:
                 self._known["box"] = fitted_grey_box(rows, body, **training)
             model = self._known["box"]
             values = rolled_out_values(model, rows, policy, gamma=gamma)[None]
-        recorded = episode_values(rows, gamma)
         if not isfinite(values.sum()):
             raise ValueError(f"{path}: its estimated values are not finite numbers.")
         found = mean_of_networks(values)
@@ -109,7 +109,7 @@ class OfflineEvaluator:
             "value_low": found.low,
             "value_high": found.high,
             "values": values.mean(0).tolist(),
-            "data_value": recorded.mean(),
+            "data_value": episode_values(rows, gamma).mean(),
         }
         write_json(file, results)
         return results

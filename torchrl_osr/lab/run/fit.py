@@ -55,7 +55,9 @@ def fit(
         columns.pop("file", None)  # no part of a log; np.savez has an argument "file"
         for name, column in columns.items():
             if column.dtype.kind == "O":  # text, or lists of one length
-                columns[name] = np.asarray(column.tolist())
+                columns[name] = plain = np.asarray(column.tolist())
+                if plain.dtype.kind == "O":  # numbers and None, which becomes NaN
+                    columns[name] = plain.astype(float)
         np.savez(content := BytesIO(), **columns)
         digest = hashlib.sha256(content.getvalue()).hexdigest()
         log = folder / "columns" / digest[:8] / f"{folder.name}.npz"

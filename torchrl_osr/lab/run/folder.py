@@ -30,9 +30,11 @@ from torchrl_osr.lab.run.config import (
     flatten,
     read_config,
     read_run,
+    read_yaml,
     write_config,
 )
 from torchrl_osr.lab.run.data import set_sizes_from_log
+from torchrl_osr.lab.run.load import POLICY
 from torchrl_osr.lab.run.schema import TrainConfig, method_name
 from torchrl_osr.trainers import Interrupted
 from torchrl_osr.trainers.interruption import (
@@ -77,8 +79,7 @@ def open_run(
     ``job``, Hydra's part of the configuration, are those of the running job by default.
     """
     job = job or HydraConfig.get()
-    if folder is None:
-        folder = Path(cfg.resume or job.runtime.output_dir).absolute()
+    folder = folder or Path(cfg.resume or job.runtime.output_dir).absolute()
     trust = list(cfg.trust)  # by the command line, not by a run's folder
     with _lock(folder):
         if cfg.resume is not None:
@@ -93,6 +94,8 @@ def open_run(
         elif new or config.force:
             set_sizes_from_log(config)
         if new:
+            if (folder / POLICY).exists():  # training would replace it
+                raise FileExistsError(f"{folder} has a policy of no run: move it away.")
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
         else:
@@ -106,8 +109,8 @@ def open_run(
         # when the data's checksum has been compared.
         there = replace(config.data, path=known.path)
         write_config(folder, replace(config, data=there))
-        choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices
-        method = method_name(choices.loss, choices.get("recovery"))
+        choices = read_yaml(folder / HYDRA)["hydra"]["runtime"]["choices"]
+        method = method_name(choices["loss"], choices.get("recovery"))
         with _status(folder):
             try:
                 yield Run(config, folder, method)
@@ -194,7 +197,6 @@ def _lock(folder: Path) -> AbstractContextManager[Any]:
 @contextmanager
 def _status(folder: Path) -> Iterator[None]:
     """Keep ``status.json`` true; log the command that continues a preempted run."""
-    end: dict[str, Any]
     running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
     with signals_raised():
         try:

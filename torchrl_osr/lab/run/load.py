@@ -98,8 +98,7 @@ def restore(
     learner.actor.load_state_dict(average.module.state_dict())
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
-    actor, model, loss, _ = learner
-    return TrainedRun(config, actor, model, loss, norm, step, path)
+    return TrainedRun(config, *learner[:3], norm, step, path)
 
 
 def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:

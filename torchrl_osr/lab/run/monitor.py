@@ -37,7 +37,7 @@ def monitor_of_run(
     config = read_run(run_folder_of(path), trust)
     log = replace(config.data, path=data_path or config.data.path)
     env = replace(config.env, id=None)  # its bounds are known: no simulator is made
-    data, _ = load_data(env if log.path else config.env, log)
+    data, _ = load_data(env, log)
     episode, counts = rows_of(data, options.fall_steps)
     rate, states = options.false_alarms, data["observation"][:]
     wanted = rate if options.episodes is None else None
