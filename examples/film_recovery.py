@@ -27,6 +27,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.data import load_behavior_policy
 from torchrl_osr.lab.envs import ExternalPush
+from torchrl_osr.lab.run.config import check_environment
 from torchrl_osr.lab.run.load import load_trained
 
 BEGIN, DURATION, EVERY, FRAMES = 100, 5, 25, 9  # steps; a frame every 25 from the push
@@ -78,6 +79,7 @@ def main(arguments=None):
 
     trained = load_trained(given.run)
     task, norm = trained.config.env, trained.observation_norm
+    check_environment(task.id)  # a run of others may name a module of theirs
     expert = load_behavior_policy(task.name, "expert").deterministic
 
     def state_of(observation):

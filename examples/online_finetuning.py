@@ -41,6 +41,7 @@ from torchrl_osr.lab.evaluation import (
     summarize,
 )
 from torchrl_osr.lab.evaluation.figures import IN_WORDS
+from torchrl_osr.lab.run.config import check_environment
 from torchrl_osr.lab.run.data import load_training_data, references_of
 from torchrl_osr.lab.run.load import TrainedRun, load_trained
 
@@ -130,6 +131,9 @@ def main(arguments: Sequence[str]) -> None:
         "--min-q-weight", type=float, help="of CQL's term; default: the run's"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--trust", action="append", default=[], help="module that the run may import"
+    )
     options = parser.parse_args(arguments)
     if options.interval % FRAMES_PER_BATCH or options.frames % options.interval:
         parser.error(
@@ -139,7 +143,8 @@ def main(arguments: Sequence[str]) -> None:
 
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)
-    run = load_trained(options.run)
+    run = load_trained(options.run, trust=options.trust)
+    check_environment(run.config.env.id, options.trust)
     if not isinstance(run.loss, OSRLoss):
         parser.error(f"{options.run} is no run of loss=osr or loss=osr_10.")
     if options.min_q_weight is not None:
