@@ -52,7 +52,7 @@ def test_a_dictionary_is_joined_in_alphabetical_order(make_policy):
     assert policy.act(many) == pytest.approx(policy.act(rows))
     one = {"velocity": torch.tensor(rows[0, 1:]), "angle": torch.tensor(rows[0, :1])}
     assert policy.value(one).item() == pytest.approx(policy.value(rows[0]), abs=1e-6)
-    policy.record["source"] = {"data": {"columns": {"observation": [*"vaw"]}}}
+    policy.record["source"] = {"data": {"observation_names": [*"vaw"]}}
     named = dict(zip("vaw", rows.T[..., None], strict=True))  # a log's columns
     assert policy.act(named) == pytest.approx(policy.act(rows))
 

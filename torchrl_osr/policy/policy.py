@@ -246,8 +246,7 @@ class Policy(nn.Module):
     def _given(self, observation: Any, *, finite: bool = True) -> tuple[Any, Tensor]:
         """Return the observation as one vector, and as rows on the policy's device."""
         data = self.record.get("source", {}).get("data") or {}
-        columns = (data.get("columns") or {}).get("observation") or ()
-        given = joined(observation, columns)
+        given = joined(observation, data.get("observation_names") or ())
         return given, self._rows("observation", given, self.observation_size, finite)
 
     def _rows(self, name: str, value: Any, size: int, finite: bool = True) -> Tensor:

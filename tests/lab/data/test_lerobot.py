@@ -135,5 +135,5 @@ def test_the_commands_read_a_folder(tmp_path, monkeypatch, capsys):
     assert [name in output for name in ("cos", "speed", "torque")] == [True] * 3
     folder = trained(tmp_path / "run", *given, "data.held_out=0.2")
     assert json.loads((folder / "inverse_dynamics.json").read_text())["rows"] > 0
-    monitor_of_run(folder, MonitorConfig(false_alarms=0.5, fall_steps=0))
+    monitor_of_run(folder, MonitorConfig(0.5, fall_steps=0, episodes=str(PENDULUM)))
     assert "monitor: an alarm beyond" in capsys.readouterr().out

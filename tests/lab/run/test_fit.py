@@ -13,8 +13,9 @@ from torchrl_osr.lab.run.config import read_run
 
 def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     rng, folder = np.random.default_rng(0), tmp_path / "o'neil" / "my arm"
-    names = ["obs_0", "obs_1", "act", "reward"]
-    frame = pd.DataFrame(rng.random((60, 4)), columns=names)
+    states = [f"obs_{number}" for number in range(11)]
+    names = [*states[::-1], "act", "reward"]
+    frame = pd.DataFrame(rng.random((60, 13)), columns=names)
     frame = frame.assign(terminated=0, episode=[f"run{row // 20}" for row in range(60)])
     small = [each for each in SMALL if not each.startswith("data.num")][1:]
     given = "loss=td3_bc", "data.action_bounds=[-1,3]"
@@ -27,10 +28,12 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     with pytest.raises(ValueError, match=r"reward.*data\.missing"):
         fit({**frame, "reward": [None, *frame["reward"][1:]]}, folder, *small, *given)
     policy = fit(frame, folder, *small, *given)
-    assert policy.act(np.zeros(2)).shape == (1,)
+    state = np.arange(11.0)  # obs_10 comes last, as in the log
+    named = dict(zip(states, state, strict=True))
+    assert policy.act(named) == policy.act(state) != policy.act(state[::-1])
     assert (policy.low, policy.high) == (-1, 3)
     assert read_run(folder).env.name == "log-my-arm"
     with pytest.raises(ValueError, match=r"my arm.npz has other contents than those"):
         fit(frame.assign(reward=0.5), folder, *small, *given)
     again = fit(frame, folder, *small, *given)  # its columns are still there
-    assert again.act(np.zeros(2)) == policy.act(np.zeros(2))
+    assert again.act(state) == policy.act(state)

@@ -130,9 +130,9 @@ def load_dataset(
     if random_share:
         random, about = rolled_out(str(name), "random", recipe, progress=progress)
         data = mix_datasets(data, random, random_share=random_share, seed=seed)
-        number = round(random_share * len(data))
+        checksum = f"{checksum}{about['checksum']}"
         means: Any = mean, _mean_return(about)
-        weights = len(data) - number, number
+        weights = 1 - random_share, random_share
         mean = None if None in means else float(np.average(means, weights=weights))
         manifest = recipe | {"random_share": random_share, "env_id": about["env_id"]}
     references = references or REFERENCE_RETURNS.get(str(env_name))

@@ -328,7 +328,7 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
         step, unit = np.asarray((times - times[0]).total_seconds()), " s"
     if not np.isfinite(step).all():
         row = int((~np.isfinite(step)).argmax())
-        raise ValueError(f"{name!r} has no value in row {row} of {len(step)}.")
+        raise ValueError(f"{name!r} is empty in row {row} of {len(step)}: fill it in.")
     order = np.lexsort((step, episode))
     rows = {key: each[order] for key, each in columns.items()}
     same, gaps = np.diff(episode[order]) == 0, np.diff(step[order]).astype(float)

@@ -60,7 +60,7 @@ class DynamicsOptions:
     rollout_steps: int = 5  # steps of a rollout
     rollout_starts: int = 50_000  # number of rollouts at a time
     perturbed_start_steps: int = 0  # largest number of random actions before a rollout
-    action_noise: float = 0.0  # largest noise on a deterministic policy's actions
+    action_noise: float = 0.0  # largest standard deviation of noise on actions
     rollout_interval: int = 1000  # gradient steps between rollouts
     generations: int = 5  # number of newest rollouts that batches are drawn from
     penalty: float = 0.0  # weight of the model's uncertainty in rewards

@@ -75,9 +75,9 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
             check_choice(key, value, CHOICES[key])
         elif key in SHARES and not 0 <= value <= 1:
             raise ValueError(f"{key} must be between 0 and 1, got {value}.")
-        elif positive and key not in MAY_BE_0 and type(value) is int:
-            check_positive(key, value, minimum=1)
-        elif key.endswith("_lr"):
+        elif positive and type(value) is int:
+            check_positive(key, value, minimum=int(key not in MAY_BE_0))
+        elif positive and type(value) is float:
             check_weight(key, value)
     return made
 
@@ -101,6 +101,8 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"{folder} holds a run of another version of torchrl-osr (format {found}, "
             f"this one reads {FORMAT}): use that version, or train again."
         )
+    if isinstance(data := content.get("data"), dict):
+        data["download"] = False  # the user decides this at each start
     return content
 
 
@@ -110,7 +112,6 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     # Of one start alone, and what is already applied.
     for key in ("resume", "force", "trust", "settings"):
         del content[key]
-    content["data"]["download"] = False
     write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
 
 

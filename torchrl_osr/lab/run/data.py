@@ -24,7 +24,10 @@ from torchrl_osr.lab.data.rows import multi_step, next_action, split_held_out
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
-OF_TRAINING = ("held_out", "standardize", "reward_scale", "reward_shift")
+OF_TRAINING = (
+    *("held_out", "standardize", "reward_scale", "reward_shift"),
+    *("checksum", "observation_names"),
+)
 """Options of the data that do not decide which rows there are."""
 
 
@@ -54,7 +57,7 @@ def load_data(
     """
     reading = asdict(options)
     reading["columns"] = read_columns(reading["columns"])
-    for name in (*OF_TRAINING, "checksum"):
+    for name in OF_TRAINING:
         del reading[name]
     if env is not None:
         reading |= {"env_name": env.name, "env_id": env.id}
@@ -98,7 +101,7 @@ def load_training_data(
 ) -> TrainingData:
     """Load a run's data, split and prepared; torch's global generator is left alone.
 
-    Their checksum is kept in the configuration.
+    Their checksum and the names of a log's observation are kept in the configuration.
 
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
     ``in_keys`` are the keys that the loss reads. If rewards are among them, or by
@@ -108,6 +111,7 @@ def load_training_data(
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)
     options.checksum = manifest["checksum"]
+    options.observation_names = manifest.get("columns", {}).get("observation")
     rewarded = not in_keys or ("next", "reward") in in_keys or config.dynamics.use
     if rewarded and not has_rewards(manifest):
         raise ValueError(NO_REWARDS)

@@ -104,6 +104,7 @@ def open_run(
                 for name in EnvironmentSpec._fields:
                     setattr(config.env, name, getattr(run.env, name))
             config.data.checksum = None if config.force else known.checksum
+            config.data.observation_names = known.observation_names
             _check_same(run, config, folder)
         # Last: config.yaml makes the folder a run's. A new data.path is stored later,
         # when the data's checksum has been compared.

@@ -46,8 +46,9 @@ def monitor_of_run(
     if options.episodes is not None:
         source = f"episodes of {options.episodes}"
         log = replace(
-            log, source="file", path=options.episodes, num_transitions=None,
-            checksum=None, random_share=0.0, download=False,
+            log, source="lerobot" if log.source == "lerobot" else "file",
+            path=options.episodes, num_transitions=None, checksum=None,
+            random_share=0.0,
         )  # fmt: skip
         own, _ = load_data(env, log)
         about = rows_of(own, options.fall_steps)

@@ -91,6 +91,7 @@ class DataConfig:
     reward_scale: float = 1.0  # factor of the training rewards
     reward_shift: float = 0.0  # added to the scaled training rewards
     checksum: str | None = None  # of the data; read from them and kept with the run
+    observation_names: list[str] | None = None  # of a log, in order; kept with the run
 
 
 @dataclass
