@@ -29,10 +29,10 @@ class StatePerturbation(Transform):
     r"""Add a perturbed state to every row: ``("perturbed", key)`` from ``key``.
 
     Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
-    freshly perturbed state for each clean one, the next state untouched. It works out
-    of place, keeps the batch size and has its own random generator, which leaves the
-    other draws of a run unchanged. In an environment it adds the same entry to
-    observations and specs.
+    freshly perturbed state for each clean one, the next state untouched. It leaves
+    the states as they are, keeps the batch size and has its own random generator, which
+    leaves the other draws of a run unchanged. In an environment it adds the same entry
+    to observations and specs.
 
     Append it after transforms that rescale the state (``ObservationNorm``).
 

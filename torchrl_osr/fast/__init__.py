@@ -1,4 +1,4 @@
-"""Faster updates of small networks, with the same numbers.
+"""Faster updates of small networks, with the same numbers up to rounding.
 
 :class:`FastUpdate` is the door, for your own training loop and for the trainer. It
 calls :func:`fuse_critics`, which lets a loss score its sampled actions with fewer,

@@ -46,7 +46,7 @@ class LossGradients:
     """Compute the losses of a batch, and add the gradients of their sum to ``grad``.
 
     See :class:`~torchrl_osr.fast.FastUpdate` for the options. ``parameters`` get a
-    gradient, by default all of the loss module.
+    gradient, by default all of the loss module. On a GPU, clear ``grad`` between calls.
     """
 
     def __init__(
@@ -77,7 +77,8 @@ class LossGradients:
             elif self.trace.fits(batch):
                 return self._replay(self.trace, batch)
         losses = self._losses(batch)
-        _total(losses).backward(inputs=self.parameters)
+        inputs = self.parameters and [p for p in self.parameters if p.requires_grad]
+        _total(losses).backward(inputs=inputs)
         return losses.detach()
 
     def _losses(self, batch: TensorDictBase) -> TensorDictBase:

@@ -21,7 +21,7 @@ GPU_CHECK_INTERVAL = 100
 
 
 class NonfiniteError(FloatingPointError):
-    """A loss or a gradient is NaN or infinite; the weights are those before the update.
+    """A loss, metric or gradient is not finite; the weights are those of before.
 
     A GPU is asked once in a hundred updates only: then the weights may be NaN, too.
     """
@@ -42,7 +42,7 @@ class FastUpdate:
     lines of a training loop for small networks, and on a GPU seven times or more. After
     ``warm_up`` updates it repeats a trace of the tensor operations, on a GPU a CUDA
     graph, with the same bits. On a CPU, plain MLP critics of this package's losses are
-    evaluated in fewer, larger products.
+    evaluated in fewer, larger products, which round otherwise.
 
     The trace follows all attributes of the loss. After you change a weight, ``gamma``,
     ``requires_grad`` or a hook, or call ``eval()``, the loss itself runs and is traced
@@ -167,10 +167,12 @@ def hold_bounds(loss_module: LossModule) -> None:
         if isinstance(head, ProbabilisticTensorDictModule):
             bounds = {}
             for name in {"low", "high"} & head.distribution_kwargs.keys():
-                bound = torch.as_tensor(head.distribution_kwargs[name], device=device)
+                given = head.distribution_kwargs[name]
+                bound = torch.as_tensor(given, device=device)
                 number = not bound.is_cuda or head.distribution_class is TanhDelta
                 alike = number and bool((bound == bound.amin()).all())
-                bounds[name] = bound.amin().item() if alike else bound
+                found = bound.amin().item() if bound.ndim else float(given)
+                bounds[name] = found if alike else bound
             head.distribution_kwargs = head.distribution_kwargs | bounds
 
 

@@ -580,7 +580,7 @@ class ActorCriticLoss(LossModule):
         return distance.sum(0), {"pred_value": found, "target_value": wanted}
 
     def check_actions(self, batch: Transitions, shape: torch.Size) -> None:
-        """Raise unless the data's actions fit; warn once if they leave the bounds."""
+        """Raise unless actions fit; warn if the first batch's leave the bounds."""
         check_action(batch.a, shape, self.tensor_keys.action)
         bounded = "action_low" in self._buffers
         if self._bounds_are_checked or not bounded or torch.compiler.is_compiling():

@@ -167,7 +167,7 @@ class Transitions:
     def of_data(self, value: Tensor) -> Tensor:
         """Return ``value``, ``[R]``, with 0 where the action is not the data's."""
         data = self.is_data
-        return value if data is None else torch.where(data, value, 0.0 * value.detach())
+        return value if data is None else torch.where(data, value, 0.0)
 
     def counted(self, valid: Tensor | None) -> Tensor | None:
         """Return the unmasked rows that are ``valid``; ``None`` stands for all."""

@@ -86,12 +86,6 @@ def policy_from_loss(
     loc = getattr(observation_norm, "loc", 0.0)
     scale = getattr(observation_norm, "scale", 1.0)
     bounded = 0 if head == "OneHotCategorical" else size
-    for name, given in {"loc": loc, "scale": scale, "low": low, "high": high}.items():
-        length = bounded if name in ("low", "high") else inputs
-        tensors[name] = torch.as_tensor(given).cpu().float().expand(length).clone()
-    width = tensors["high"] - tensors["low"]
-    if not (width > 0).all() or width.isinf().any():
-        raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
     record = {
         "distribution": head,
         "observation_size": inputs,
@@ -102,10 +96,19 @@ def policy_from_loss(
         "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
     try:
+        for name, x in {"loc": loc, "scale": scale, "low": low, "high": high}.items():
+            length = bounded if name in ("low", "high") else inputs
+            tensors[name] = torch.as_tensor(x).cpu().float().expand(length).clone()
         policy = Policy(record, tensors)
-    except (KeyError, RuntimeError) as error:  # an activation; names of parameters
-        raise ValueError(f"a network has layers that no policy has: {error}") from error
-    _check_same(policy, loss)
+        _check_same(policy, loss)
+    except (KeyError, RuntimeError, TypeError) as error:  # names, sizes, activations
+        raise ValueError(
+            "a network has layers that no policy has, or norm or bounds have another "
+            f"length: {error}"
+        ) from error
+    width = policy.high - policy.low
+    if not (width > 0).all() or width.isinf().any():
+        raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
     return policy
 
 

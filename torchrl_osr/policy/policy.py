@@ -350,7 +350,7 @@ def joined(observation: Any, columns: Sequence[str] = ()) -> Any:
     keys = columns if {*columns} == {*observation} else sorted(observation)
     parts = [joined(observation[key]) for key in keys]
     if all(isinstance(part, Tensor) for part in parts):
-        return torch.cat(parts, -1)
+        return torch.cat([torch.atleast_1d(part) for part in parts], -1)
     return np.concatenate([np.atleast_1d(part) for part in parts], -1)
 
 

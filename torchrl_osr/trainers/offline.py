@@ -75,13 +75,13 @@ class OfflineTrainer(Trainer):
             :meth:`~torchrl.trainers.Trainer.register_op`. They run before the
             checkpoint (``post_steps``) and the evaluation (``post_steps_log``).
         components: more state to checkpoint, by name: a transform with a generator, a
-            learning rate schedule, an average of the weights.
+            schedule of learning rates or coefficients, an average of the weights.
         evaluation: run before the first step, at its interval and at the end, after the
             checkpoint. The results are in ``history``. Default: none.
         checkpoint_interval: in steps. Default: that of the evaluation, or 5000.
         checkpoints_kept: regular ones; the newest and the best stay too. Default 2.
         loggers: TorchRL loggers; all get every number. Default: none.
-        log_interval: steps between log entries, which are means over them. Default 200.
+        log_interval: most steps between log entries, which are means. Default 200.
         description: name of the phase in progress bar and logs. Default "train".
         progress: show a progress bar on a terminal; elsewhere a line is logged every
             half minute. Default ``True``.

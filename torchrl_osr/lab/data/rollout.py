@@ -104,7 +104,7 @@ def collect_transitions(
     Each policy plays episode after episode until its share is full; the last row of
     a share is then marked truncated. Rows are ordered by policy and time. The stored
     actions are the executed ones, clipped to ±0.999. The task is one of
-    :func:`~torchrl_osr.lab.data.make_environment`.
+    :func:`~torchrl_osr.lab.data.make_environment`, with continuous actions.
 
     Also return returns and lengths ``[E]`` of complete episodes.
     """

@@ -70,7 +70,7 @@ class EliteNetworks:
 
     def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
         """Return ``[E, n, S + 1]`` at ``[E, n, S]`` and ``[E, n, A]``."""
-        hidden = torch.cat([observation, action], -1)
+        hidden = torch.cat([observation, action], -1).to(self.weights[0].dtype)
         *layers, last = zip(self.biases, self.weights, strict=True)
         for bias, weight in layers:
             hidden = self.activation(torch.baddbmm(bias, hidden, weight))

@@ -56,14 +56,14 @@ def deterministic_policy(
 ) -> UnitPolicy:
     """Return the actor's deterministic action as a function of raw observations.
 
-    Of discrete actions that is the number of the likeliest. Pass the
+    Of one-hot actions that is the number of the likeliest. Pass the
     ``observation_norm`` of the training data if the actor needs standardised states.
     """
 
     @torch.no_grad()
     def policy(observation: Tensor) -> Tensor:
         if observation_norm is not None:
-            observation = (observation - observation_norm.loc) / observation_norm.scale
+            observation = observation_norm._apply_transform(observation)
         batch = TensorDict({"observation": observation}, [len(observation)])
         distribution = actor_network.get_dist(batch)
         action: Tensor = distribution.deterministic_sample
@@ -128,7 +128,7 @@ class EpisodeEvaluator:
         while running:
             rows = everyone if self.fixed_batch else running
             batch = torch.from_numpy(observations[rows]).to(self.device)
-            actions = dict(zip(rows, policy(batch).cpu().numpy(), strict=True))
+            actions = dict(zip(rows, policy(batch).detach().cpu().numpy(), strict=True))
             unfinished = []
             for episode in running:
                 step = self.environments[episode].step(actions[episode])

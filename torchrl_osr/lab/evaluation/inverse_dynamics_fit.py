@@ -22,7 +22,7 @@ def inverse_dynamics_report(
     """Measure the accuracy on held-out data ``[N]``, without its ``done`` rows.
 
     Returns:
-        ``"nll"``, mean negative log-likelihood in nats, and ``"rows"``. Of discrete
+        ``"nll"``, mean negative log-likelihood in nats, and ``"rows"``. Of one-hot
         actions also ``"accuracy"``, share of rows whose action is the likeliest. Of
         continuous ones ``"r2"``, share of each action dimension's variance that the
         deterministic action explains.

@@ -55,7 +55,8 @@ def evaluate_paired(
     """Play clean episodes once, and the same episodes under each disturbance.
 
     Episodes of a pair have the same seed and start state, and the policy is called
-    with batches of one size. Until the disturbance acts they are equal, bit for bit.
+    with batches of one size. Until the disturbance acts, those of a deterministic
+    policy are equal, bit for bit.
     Warn if the environment ignores its seed. The policy is called on the CPU.
 
     Keyword Args:

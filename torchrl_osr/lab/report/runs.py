@@ -101,7 +101,7 @@ def read_runs(folders: Sequence[Path]) -> RunTables:
 
     Runs of one method differ only in the seed, and in settings that depend on the data
     set. Other differences become part of the method's name. Of two runs of one method,
-    data set and seed the later one counts.
+    data set and seed the one counts that is last in the order of folders and paths.
     """
     found: list[_Run] = []
     left_out: list[tuple[str, str]] = []
@@ -133,7 +133,7 @@ def read_runs(folders: Sequence[Path]) -> RunTables:
     last = runs.groupby(cell)["folder"].transform("last")
     again = runs.duplicated(cell, "last")
     left_out += [
-        (folder, f"{later} is a later run of the same method, data and seed")
+        (folder, f"{later} has the same method, data and seed, and comes later")
         for folder, later in zip(runs["folder"][again], last[again], strict=True)
     ]
     runs = runs[~again]

@@ -169,7 +169,7 @@ def load_switching_policy(
             raise ValueError(f"None of the runs has a model, {MODEL}: train loss=rim.")
         grey = [each for each in parts if each.body is not None]
         models = grey[0] if grey else EliteNetworks.join(parts)
-        options = ({"steps": 40, "hold": 10} if grey else {}) | options
-        options["terminated"] = termination(configs[0].env.id, models.limits)
-    gamma = configs[0].optim.gamma
-    return SwitchingPolicy(policies, models, value, gamma=gamma, **options)
+        known = {"terminated": termination(configs[0].env.id, models.limits)}
+        options = ({"steps": 40, "hold": 10} if grey else {}) | known | options
+    options = {"gamma": configs[0].optim.gamma} | options
+    return SwitchingPolicy(policies, models, value, **options)
