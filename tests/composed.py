@@ -36,6 +36,11 @@ def composed(config: str, *overrides: str) -> DictConfig:
         return compose(config, list(overrides))
 
 
+def options(group: str) -> list[str]:
+    """The names of a group's configurations."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
 def configured(*overrides: str) -> TrainConfig:
     """The checked configuration of a run, with the sizes of its environment."""
     config = checked(composed("train", *overrides))
@@ -45,9 +50,7 @@ def configured(*overrides: str) -> TrainConfig:
 
 def evaluating(*overrides: str) -> EvaluateConfig:
     """The configuration of an evaluation."""
-    cfg = composed("evaluate", "progress=false", *overrides)
-    config: EvaluateConfig = OmegaConf.to_object(cfg)
-    return config
+    return OmegaConf.to_object(composed("evaluate", "progress=false", *overrides))
 
 
 def job(*overrides: str) -> DictConfig:

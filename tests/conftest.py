@@ -19,8 +19,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-OBSERVATION_DIM, ACTION_DIM = 3, 2
-
 
 def pytest_collection_finish() -> None:
     """Spare the garbage collector the walk through everything that was imported."""
@@ -41,13 +39,7 @@ def transitions():
     seeds give equal transitions.
     """
 
-    def make(
-        *size: int,
-        observation: int = OBSERVATION_DIM,
-        action: int = ACTION_DIM,
-        dtype: torch.dtype = torch.float32,
-        seed: int = 7,
-    ) -> TensorDict:
+    def make(*size, observation=3, action=2, dtype=torch.float32, seed=7) -> TensorDict:
         generator = torch.Generator().manual_seed(seed)
 
         def normal(dim: int) -> torch.Tensor:

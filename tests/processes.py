@@ -11,6 +11,15 @@ from warm import Server
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
+def files_of(folder: Path, *more: str) -> dict[str, bytes]:
+    """Results, networks, log entries and more of a run: files that have no time."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for pattern in ("*.json", "**/*.safetensors", "**/*.csv", *more)
+        for path in folder.glob(pattern)
+    }
+
+
 @pytest.fixture(scope="module", autouse=True)
 def own_cache(tmp_path_factory):
     """One cache for the tests of a file, and one thread; processes inherit both."""
@@ -44,17 +53,18 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory, server) -> Callable[..., tuple[int, str]]:
+def run(tmp_path_factory, server) -> Callable[..., str]:
     """Return a function that runs a command, or an example's file.
 
-    It returns the exit code, and what was printed.
+    It expects an exit code, by default 0, and returns what was printed.
     """
     outputs = tmp_path_factory.mktemp("outputs")
 
-    def run(cwd: Path, name: str, *arguments: str) -> tuple[int, str]:
+    def run(cwd: Path, name: str, *arguments: str, code: int = 0) -> str:
         name = str(EXAMPLES / name) if name.endswith(".py") else name
         output = outputs / f"{len(list(outputs.iterdir()))}.txt"
         server.start(name, *arguments, output=output, folder=cwd)
-        return server.ended(), output.read_text(encoding="utf-8")
+        assert server.ended() == code, output.read_text(encoding="utf-8")
+        return output.read_text(encoding="utf-8")
 
     return run

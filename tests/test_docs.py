@@ -13,26 +13,20 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 PAGES += ROOT.glob("torchrl_osr/**/MODEL_CARD.md")
-
+LINKED = [*PAGES, *ROOT.glob("results/**/*.md"), *ROOT.glob("CONTRIBUTING.md")]
 
 # The commands of these pages run with their blocks: tests/lab/cli/test_*_page.py.
 WITH_COMMANDS = {ROOT / "docs" / f"{name}.md" for name in ("no_simulator", "your_data")}
 
 
-@pytest.mark.parametrize(
-    "page", sorted({*PAGES} - WITH_COMMANDS), ids=lambda page: page.name
-)
+@pytest.mark.parametrize("page", sorted({*PAGES} - WITH_COMMANDS), ids=lambda p: p.name)
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path))
     check_md_file(page, memory=True)
 
 
-@pytest.mark.parametrize(
-    "page",
-    [*PAGES, *ROOT.glob("results/**/*.md"), *ROOT.glob("CONTRIBUTING.md")],
-    ids=lambda page: str(page.relative_to(ROOT)),
-)
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_resolve(page):
     text = re.sub(r"(?s)```.*?```", "", page.read_text(encoding="utf-8"))
     targets = re.findall(r"\]\((?!\w+:)([^)#\s]+)", text)

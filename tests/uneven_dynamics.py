@@ -39,6 +39,15 @@ def plain_gaussian(
     return mean, torch.exp(low + torch.log(1 + torch.exp(free - low)))
 
 
+def compare_models(check, label: str, *pairs: tuple[Tensor, nn.Module]) -> None:
+    """Compare losses, each with its model, and the gradients of their means."""
+    found = (
+        [loss.detach(), *torch.autograd.grad(loss.mean(), [*model.parameters()])]
+        for loss, model in pairs
+    )
+    check(label, *found, tolerance=1e-10)
+
+
 def linear_dynamics(
     sizes: tuple[int, int],
     weights: dict[tuple[int, int], float],

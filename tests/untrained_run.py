@@ -34,16 +34,12 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
         torch.full(sizes[:1], 2.0), torch.full(sizes[:1], 3.0), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    checkpoint = safe_checkpoint(
-        loss_module=objective,
-        observation_norm=norm,
-        policy_average=AveragedModel(actor),
-        history=[],
-    )
+    parts = {"loss_module": objective, "observation_norm": norm}
+    parts["policy_average"] = AveragedModel(actor)
+    checkpoint = safe_checkpoint(**parts, history=[])
     rotation = CheckpointRotation(folder / CHECKPOINTS, keep_last=2)
     for step in (5, 10, 900):
         rotation.save(checkpoint, step=step)
     best = folder / CHECKPOINTS / "best.torchrl"
-    names = ("loss_module", "observation_norm", "policy_average")
-    checkpoint.save(best, components=names, metadata={"step": 10, "score": 1.0})
+    checkpoint.save(best, components=[*parts], metadata={"step": 10, "score": 1.0})
     return deterministic_policy(actor, norm), loss

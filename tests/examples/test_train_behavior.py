@@ -19,8 +19,7 @@ def test_policies_are_written_that_load_and_play(tmp_path, run):
         "--random-steps=96", "--eval-every=96", "--eval-steps=200",
         "--card-steps=400", "--batch-size=16",
     )  # fmt: skip
-    code, output = run(tmp_path, "train_behavior.py", *options)
-    assert code == 0, output
+    run(tmp_path, "train_behavior.py", *options)
     card = load_behavior_card(tmp_path)["invertedpendulum"]
     files = {path.stem for path in (tmp_path / "invertedpendulum").glob("*.npz")}
     assert card["env"] == "InvertedPendulum-v5"

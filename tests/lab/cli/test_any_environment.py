@@ -87,14 +87,6 @@ def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, caps
     record(tmp_path / "x.npz", f"policy={saved}", f"env.id={env_id}", "episodes=1")
 
 
-def test_own_references_make_scores(tmp_path):
-    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
-    given = ("env.id=Pendulum-v1", f"data.path={log}", "env.random_return=-1200")
-    run = trained(tmp_path / "scored", *given, "env.expert_return=-200")
-    last = json.loads((run / "returns.json").read_text())["last"]
-    assert last["score"] == pytest.approx((last["return"] + 1200) / 10)
-
-
 def test_a_run_knows_its_data_by_their_contents(tmp_path):
     record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
     given = "env.id=Pendulum-v1", "loss=td3_bc"
@@ -119,13 +111,16 @@ def test_a_run_knows_its_data_by_their_contents(tmp_path):
 
 
 def test_a_run_that_fails_before_its_training_is_none(tmp_path):
-    """A corrected command may use its folder."""
+    """A corrected command may use its folder; references of one's own make scores."""
     given = "env.id=Pendulum-v1", f"data.path={tmp_path}/log.npz"
     with pytest.raises(FileNotFoundError, match="no file"):
         trained(tmp_path / "run", *given, "loss=osr")
     assert find_runs([tmp_path]) == []
     record(tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
-    trained(tmp_path / "run", *given, "loss=td3_bc")
+    given += "loss=td3_bc", "env.random_return=-1200", "env.expert_return=-200"
+    run = trained(tmp_path / "run", *given)
+    last = json.loads((run / "returns.json").read_text())["last"]
+    assert last["score"] == pytest.approx((last["return"] + 1200) / 10)
 
 
 class Late(PendulumEnv):
@@ -253,9 +248,7 @@ def test_runs_that_read_one_log_in_two_ways_have_their_own_rows(tmp_path):
     assert cost == -profit < 0
 
 
-def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(
-    tmp_path, capsys, monkeypatch
-):
+def test_bounds_and_discrete_actions_may_be_given(tmp_path, capsys, monkeypatch):
     record(log := tmp_path / "real.npz", "env.id=Pendulum-v1", "episodes=3")
     given = "env=none", f"data.path={log}", "data.action_bounds=[-3,2.5]", "loss=td3_bc"
     env = read_run(trained(tmp_path / "real", *given)).env

@@ -17,10 +17,14 @@ from torchrl_osr.lab.__main__ import COMMANDS, main
 from torchrl_osr.lab.cli.console import sentence
 
 
-def test_help_lists_every_command(capsys):
+def test_help_and_an_unknown_command_list_commands_and_version_packages(capsys):
     main([])
     printed = capsys.readouterr().out
     assert re.findall(r"(?m)^  ([\w-]+)  +[a-z]", printed) == list(COMMANDS)
+    main(["--version"])
+    assert capsys.readouterr().out.startswith(f"torchrl-osr {__version__}, python 3.")
+    with pytest.raises(SystemExit, match=r"'trian' \(did you mean 'train'\?\); it has"):
+        main(["trian"])
 
 
 def test_help_is_quick_and_has_no_raw_configuration():
@@ -30,20 +34,9 @@ def test_help_is_quick_and_has_no_raw_configuration():
         "lab.main([]); [lab.main([name, '--help']) for name in lab.CONFIGS]\n"
         "sys.exit('torch' in sys.modules)"
     )
-    command = [sys.executable, "-c", code]
-    printed = subprocess.check_output(command, text=True)
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True)
     assert "half-widths of their bounds" in printed
     assert "action_low" not in printed
-
-
-def test_version_begins_with_the_package(capsys):
-    main(["--version"])
-    assert capsys.readouterr().out.startswith(f"torchrl-osr {__version__}, python 3.")
-
-
-def test_unknown_command_lists_commands():
-    with pytest.raises(SystemExit, match=r"'trian' \(did you mean 'train'\?\); it has"):
-        main(["trian"])
 
 
 QUOTED = "cannot be read: quote a value with blanks, brackets or quotes, as in "
@@ -92,25 +85,21 @@ def test_other_errors_are_one_sentence():
 
 def test_error_is_printed_once_and_debug_shows_where(tmp_path, run):
     wrong = ["loss.recovery_weight=-1", "hydra.run.dir=run"]
-    code, output = run(tmp_path, "train", *wrong)
-    assert code == 1
-    printed = output.splitlines()[-1]
-    assert "recovery_weight" in printed
+    output = run(tmp_path, "train", *wrong, code=1)
+    assert "recovery_weight" in output.splitlines()[-1]
     assert "Traceback" not in output
     log = (tmp_path / "run" / "train.log").read_text()
     assert "Traceback (most recent call last)" in log
-    code, output = run(tmp_path, "evaluate", "checkpoint=nowhere", "--debug")
-    assert code == 1
+    output = run(tmp_path, "evaluate", "checkpoint=nowhere", "--debug", code=1)
     assert output.startswith("Traceback")
     assert "FileNotFoundError: there is no run" in output
 
 
 def test_a_mistyped_folder_is_not_left_behind_and_home_is_expanded(tmp_path, run):
-    code, output = run(tmp_path, "train", "resume=~/outputs/typo")
-    assert code == 1
+    output = run(tmp_path, "train", "resume=~/outputs/typo", code=1)
     start = f"resume={Path.home()}/outputs/typo: there is no config.yaml in it; give"
     assert output.startswith(start)
     given = "data.columns=names.yaml", "data.columns.reward=goal"
-    _, output = run(tmp_path, "data", *given)
+    output = run(tmp_path, "data", *given, code=1)
     assert output.startswith("data.columns=<file> replaces all data.columns.<part>")
     assert list(tmp_path.iterdir()) == []

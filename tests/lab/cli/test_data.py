@@ -37,11 +37,9 @@ def write_log(path, **changes):
 
 
 NAMED = [
-    "data.path=log.csv",
-    "data.columns.observation=[cos,sin,speed]",
-    "data.columns.action=torque",
-    "data.columns.terminated=false",
-]
+    "data.path=log.csv", "data.columns.observation=[cos,sin,speed]",
+    "data.columns.action=torque", "data.columns.terminated=false",
+]  # fmt: skip
 
 
 def test_a_log_is_described(look, tmp_path):
@@ -60,8 +58,7 @@ def test_a_log_is_described(look, tmp_path):
 def test_what_looks_wrong_is_numbered(look):
     write_log("log.csv", speed=0.5)
     swapped = [*NAMED[:1], "data.columns.observation=[speed,cos,sin]", *NAMED[2:]]
-    output = look(*swapped, "env.id=Pendulum-v1")
-    assert "1. speed is 0.5 in every row" in output
+    assert "1. speed is 0.5 in every row" in look(*swapped, "env.id=Pendulum-v1")
 
 
 @pytest.mark.parametrize(
@@ -91,8 +88,7 @@ def test_a_file_names_the_columns_of_an_observation_by_keys(look):
     output = look(*maze, "data.columns=columns.yaml")
     assert re.search(r"y -> achieved_goal\[1\] .*\n +goal_x -> desired_goal", output)
     assert "text      separator ',', decimal '.'" in output
-    config = composed("train", *maze, "data.columns=columns.yaml")
-    read = checked(config).data
+    read = checked(composed("train", *maze, "data.columns=columns.yaml")).data
     assert (read.columns.action, read.num_transitions) == (["u", "v"], None)
 
 

@@ -53,8 +53,7 @@ def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
     for path in (sweep / "1_damaged" / "checkpoint" / "policy").glob("checkpoint-*"):
         path.write_bytes(path.read_bytes()[:100])
     options = ["sweep=sweep", "jobs=2", "suite=start", "episodes=2", "last=1"]
-    code, output = run(tmp_path, "evaluate", *options)
-    assert code == 1
+    output = run(tmp_path, "evaluate", *options, code=1)
     lines = output.splitlines()
     assert lines[0] == "left out: sweep/2_running: not finished, its status is running"
     assert lines[1] == "left out: sweep/3_copied: not finished, its status is unknown"

@@ -19,8 +19,7 @@ def test_from_a_run_to_each_kind_of_file(tmp_path, run):
         ("p.safetensors", "p.pt2"),
         ("run/checkpoint/policy/best.torchrl", "new/v.pt2", "--output", "value"),
     ]:
-        code, output = run(tmp_path, "export", *arguments)
-        assert code == 0, output
+        output = run(tmp_path, "export", *arguments)
         step = 10 if "best" in arguments[0] else 900
         assert f"OSRLoss, Hopper-v5, step {step}, without a monitor\n" in output
         assert float(output.rpartition(" ")[2]) <= 1e-6
@@ -39,16 +38,14 @@ def test_a_monitor_of_the_runs_data(tmp_path, run):
     save(tmp_path / "own.npz", columns | {"observation": rows * 2})
     make_run(tmp_path / "run", "data=file", f"data.path={tmp_path}/old.npz")
     given = ["data.path=log.npz", "monitor.false_alarms=0.1", "monitor.fall_steps=5"]
-    code, output = run(tmp_path, "export", "run", "m.safetensors", *given)
-    assert code == 0, output
+    output = run(tmp_path, "export", "run", "m.safetensors", *given)
     assert "in at most 0.1 of episodes like the 50 held-out episodes" in output
     assert f"{5 * fell.sum()} rows in the 5 steps before a terminal state" in output
     alarm = load_policy(tmp_path / "m.safetensors").monitor(rows)[1].reshape(100, 40)
     assert alarm[late].all()
     assert np.where(late, False, alarm).any(1).mean() <= 0.1
     given += ["monitor.episodes=own.npz", "monitor.false_alarms=0.01"]
-    code, output = run(tmp_path, "export", "run", "m.pt2", *given)
-    assert code == 0, output
+    output = run(tmp_path, "export", "run", "m.pt2", *given)
     assert "100 episodes of own.npz" in output
 
 
@@ -64,17 +61,13 @@ def test_a_file_that_deviates_is_reported(tmp_path):
 
 
 def test_what_cannot_be_exported_is_one_line(tmp_path, run):
-    make_run(tmp_path / "run")
-    for arguments, message in [
-        (["nowhere", "p.onnx"], "there is no run and no checkpoint at nowhere."),
-        (["run", "p.pt2", "monitor.rate=1"], "there is no key 'monitor.rate'; its"),
-        (
-            ["run", "p.pt2", "monitor.fall_steps=1", "--output", "value"],
-            "leave out --output value",
-        ),
-        (["nowhere", "p.pt"], "must end in .safetensors, .onnx or .pt2.\n"),
+    make_run(tmp_path / "r")
+    for code, arguments, message in [
+        (1, "nowhere p.onnx", "there is no run and no checkpoint at nowhere."),
+        (1, "r p.pt2 monitor.rate=1", "there is no key 'monitor.rate'; its"),
+        (2, "r p.pt2 monitor.fall_steps=1 --output value", "leave out --output value"),
+        (2, "nowhere p.pt", "must end in .safetensors, .onnx or .pt2.\n"),
     ]:
-        code, output = run(tmp_path, "export", *arguments)
-        assert code != 0
+        output = run(tmp_path, "export", *arguments.split(), code=code)
         assert message in output
         assert "Traceback" not in output

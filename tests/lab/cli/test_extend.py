@@ -35,8 +35,7 @@ def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
     save_files(tmp_path)
 
     def read(command: str, *sizes: str) -> str:
-        code, output = run(tmp_path, *typed(command), *sizes)
-        assert code == 0, output
+        output = run(tmp_path, *typed(command), *sizes)
         assert "Warning" not in output
         return output
 
@@ -63,5 +62,4 @@ def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
     # One's own run is exported without trust: nothing of the modules is needed.
     for name in ("my_losses.py", "point_mass.py"):
         (tmp_path / name).unlink()
-    code, output = run(tmp_path, "export", "runs/awac", "policy.pt2")
-    assert code == 0, output
+    run(tmp_path, "export", "runs/awac", "policy.pt2")

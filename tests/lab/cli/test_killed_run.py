@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from processes import files_of
 
 KILLED = 128 + signal.SIGKILL
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGHUP: 75}
@@ -53,14 +54,8 @@ def status(folder: Path) -> dict:
 
 
 def results(folder: Path) -> dict:
-    """What a run leaves: results, networks, log entries; files that have no time."""
-    left = {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for pattern in ("*.json", "**/*.safetensors", "**/*.csv")
-        for path in folder.glob(pattern)
-    }
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-    return left | {"names": names}
+    return files_of(folder) | {"names": names}
 
 
 def assert_same_results(folder: Path, undisturbed: Path) -> None:

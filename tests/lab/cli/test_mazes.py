@@ -16,8 +16,7 @@ def test_a_recorded_ant_is_trained_on(run, tiny, tmp_path):
     ant, log = "env=antmaze-umaze", tmp_path / "ant.npz"
     collect.main(composed("collect", ant, f"path={log}", "episodes=3"))
     given = [*tiny("file"), ant, f"data.path={log}", "preset=antmaze"]
-    code, printed = run(tmp_path, "train", *given, "hydra.run.dir=run")
-    assert code == 0, printed
+    printed = run(tmp_path, "train", *given, "hydra.run.dir=run")
     for word in ("Warning", "WARN", "Traceback", "Adroit"):
         assert word not in printed
     last = json.loads((tmp_path / "run" / "returns.json").read_text())["last"]

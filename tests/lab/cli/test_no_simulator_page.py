@@ -20,18 +20,16 @@ def test_the_page_leads_from_a_log_to_an_alarm(tmp_path, run):
     (names,) = grab_code_blocks(text, lang="yaml")
     (tmp_path / "columns.yaml").write_text(names, encoding="utf-8")
 
-    def python(code: str) -> str:
-        command = [sys.executable, "-c", code]
+    def python(*code: str) -> str:
+        command = [sys.executable, "-c", "\n".join(code)]
         return subprocess.check_output(command, cwd=tmp_path, text=True)
 
     python(record)
     for command in grab_code_blocks(text, lang="bash"):
-        code, output = run(tmp_path, *shlex.split(command)[1:])
-        assert code == 0, output
+        run(tmp_path, *shlex.split(command)[1:])
     file = tmp_path / "arm" / "offline_evaluation.json"
     estimate = json.loads(file.read_text())["value"]
-    last = "\nimport sys\nassert 'torch' not in sys.modules"
-    output = python("\n".join(use) + last)
+    output = python(*use, "import sys\nassert 'torch' not in sys.modules")
     assert "The first alarm is in step 100." in output
     measured, false = map(float, re.findall(r"return (-\d+), .* in (\d+)%", output)[0])
     assert abs(measured - estimate) < 40

@@ -96,9 +96,7 @@ def with_truncated(table):
         (lambda table: table, {"reward": "timestamp"}, 2),
     ],
 )
-def test_columns_and_terminal_ends_are_the_users_choice(
-    edited, change, columns, terminated
-):
+def test_columns_and_terminal_ends_are_chosen(edited, change, columns, terminated):
     data, manifest = load(edited(change), columns=columns)
     assert data["next", "terminated"].sum() == terminated == manifest["terminated_ends"]
     assert len(manifest["episode_lengths"]) == 5

@@ -20,7 +20,6 @@ pytestmark = [
     pytest.mark.usefixtures("cache"),
 ]
 
-FORMATS = ["hdf5", "arrow", "parquet"]
 LENGTHS = [5, 1, 12, 3, 2, 4, 1, 2, 3, 6, 2, 5]  # more than ten: 10 sorts before 2
 
 VECTOR = spaces.Box(-np.inf, np.inf, (3,))
@@ -62,12 +61,11 @@ def make(name, observations=VECTOR, actions=UNIT, data_format="hdf5"):
         )
         buffers.append(buffer)
     known = {"observation_space": observations, "action_space": actions}
-    return minari.create_dataset_from_buffers(
-        name, buffers, data_format=data_format, **known
-    )
+    known["data_format"] = data_format
+    return minari.create_dataset_from_buffers(name, buffers, **known)
 
 
-@pytest.mark.parametrize("data_format", FORMATS)
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
 @pytest.mark.parametrize("space", [VECTOR, NESTED], ids=["vector", "dictionary"])
 def test_every_row_is_minaris_own(space, data_format):
     made = make("test/set-v0", space, data_format=data_format)

@@ -110,49 +110,45 @@ def test_returns_are_near_the_card(env_name: str) -> None:
     assert np.median(returns) == pytest.approx(card["stochastic_return"][0], rel=0.2)
 
 
-def cells_of(env_id, positions):
+def check_maze(data, env_id):
+    """Check rows and rewards; return starts, and pairs of cells, of start and goal."""
+    check_sound(data)
+    reward, terminated = data["next", "reward"], data["next", "terminated"]
+    assert ((reward == 1) == terminated).all()
+    assert ((reward == 0) | (reward == 1)).all()
+    first = np.r_[True, data["next", "done"].flatten()[:-1]]
+    starts = data["observation"].numpy()[first]
     with closing(make_environment(env_id)) as env:
-        maze = env.unwrapped.maze
-        return [tuple(maze.cell_xy_to_rowcol(each).tolist()) for each in positions]
+        cell = env.unwrapped.maze.cell_xy_to_rowcol
+        cells = [tuple(cell(xy).tolist()) for xy in starts[:, :4].reshape(-1, 2)]
+    return starts, {*zip(cells[::2], cells[1::2], strict=True)}
 
 
 @pytest.mark.parametrize("source", ["diverse", "play"])
 def test_nearly_every_episode_reaches_its_goal(source):
     name = "pointmaze-large" if source == "play" else "pointmaze-umaze"
     data, returns, _ = collect_source(name, source, 6000, progress=False)
-    check_sound(data)
+    starts, pairs = check_maze(data, MAZE_IDS[name])
     assert len(returns) >= 15
     assert returns.mean() > 0.95
-    reward, terminated = data["next", "reward"], data["next", "terminated"]
-    assert ((reward == 1) == terminated).all()
-    assert ((reward == 0) | (reward == 1)).all()
     # The goal stays, and the noise leaves most of the actions inside of their bounds.
     assert (data["observation"][:, 2:4] == data["next", "observation"][:, 2:4]).all()
     assert (data["action"].abs() > 0.998).float().mean() < 0.3
     assert data["action"].std(0).min() > 0.4
     if source == "play":
-        first = np.r_[True, data["next", "done"].flatten()[:-1]]
-        starts = data["observation"].numpy()[first]
-        places = [cells_of(MAZE_IDS[name], starts[:, i : i + 2]) for i in (0, 2)]
-        assert set(zip(*places, strict=True)) <= set(PLAY_CELLS["large"])
+        assert pairs <= set(PLAY_CELLS["large"])
         assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in cells"
 
 
 @pytest.mark.parametrize("source", ["umaze", "diverse"])
 def test_most_ants_reach_their_goal_and_a_time_out_is_no_terminal(source):
     data, returns, lengths = collect_source("antmaze-umaze", source, 5000, seed=2)
-    check_sound(data)
+    _, pairs = check_maze(data, MAZE_IDS["antmaze-umaze"])
     assert set(returns) <= {0, 1}
     assert returns.mean() > 0.5
-    reward, terminated = data["next", "reward"], data["next", "terminated"]
-    assert ((reward == 1) == terminated).all()
-    assert ((reward == 0) | (reward == 1)).all()
     # Without the goal an episode lasts 700 steps, and its end is a time-out.
     assert set(lengths[returns == 0]) == {700}
-    assert (data["next", "done"] == terminated | data["next", "truncated"]).all()
-    assert data["next", "truncated"].sum() >= (returns == 0).sum()
-    first = np.r_[True, data["next", "done"].flatten()[:-1]]
-    starts = data["observation"].numpy()[first]
-    places = [cells_of(MAZE_IDS["antmaze-umaze"], starts[:, i : i + 2]) for i in (0, 2)]
-    pairs = set(zip(*places, strict=True))
+    terminated, truncated = data["next", "terminated"], data["next", "truncated"]
+    assert (data["next", "done"] == terminated | truncated).all()
+    assert truncated.sum() >= (returns == 0).sum()
     assert (pairs == {TEST_CELLS["umaze"]}) == (source == "umaze")

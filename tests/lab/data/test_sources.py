@@ -15,6 +15,8 @@ from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS
 
 pytestmark = pytest.mark.usefixtures("cache")
 
+COLLECT = "'torchrl-osr collect env.id=Pendulum-v1 path=Pendulum-v1.npz', then add"
+
 
 def roll_out(source="random", **options):
     options = {"num_transitions": 300, "progress": False} | options
@@ -91,15 +93,14 @@ def d4rl_columns(data):
 def test_recorded_data_are_read(source, tmp_path):
     rows, _ = roll_out("medium")
     path = str(save(tmp_path / "hopper.hdf5", d4rl_columns(rows)))
-    options = {"path": path}
-    data, manifest = load_dataset("hopper", source, env_id="Hopper-v5", **options)
+    data, manifest = load_dataset("hopper", source, env_id="Hopper-v5", path=path)
     assert (data == rows).all()
     score = REFERENCE_RETURNS["hopper"].score(manifest["mean_return"])
     assert (manifest["source"], manifest["normalized_score"]) == (source, score)
-    _, other = load_dataset("another", source, **options)
+    _, other = load_dataset("another", source, path=path)
     assert other["normalized_score"] is None
     with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
-        load_dataset("walker2d", source, env_id="Walker2d-v5", **options)
+        load_dataset("walker2d", source, env_id="Walker2d-v5", path=path)
 
 
 @pytest.mark.parametrize(("bounds", "high"), [(None, 2), ([[-4.0], [4.0]], 4)])
@@ -122,11 +123,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
         ("medium", {"env_name": "log-arm"}, "for a log, give data=file"),
         ("random", {"random_share": 0.5}, "random rows: choose another source"),
         ("d4rl", {"path": "x", "columns": {"reward": "x"}}, "columns=.* has no effect"),
-        (
-            "medium",
-            {"env_id": "Pendulum-v1"},
-            "'torchrl-osr collect env.id=Pendulum-v1 path=Pendulum-v1.npz', then add",
-        ),
+        ("medium", {"env_id": "Pendulum-v1"}, COLLECT),
     ],
 )
 def test_useless_options_are_refused(source, options, message):

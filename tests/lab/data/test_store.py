@@ -54,7 +54,7 @@ def test_what_fails_leaves_no_set(load, data, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["set.safetensors.lock"]
 
 
-def test_a_damaged_set_is_made_anew(load, tmp_path):
+def test_a_damaged_set_is_made_anew_and_a_whole_one_read(load, tmp_path, monkeypatch):
     load()
     path = tmp_path / "set.safetensors"
     content = path.read_bytes()
@@ -62,10 +62,6 @@ def test_a_damaged_set_is_made_anew(load, tmp_path):
     load()
     assert load.made == 2
     assert "Making" in load.warnings[0]
-
-
-def test_a_whole_set_is_read_without_writing(load, monkeypatch):
-    load()
 
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")

@@ -37,12 +37,10 @@ def csv(folder, frame):
 @pytest.fixture(params=[".csv", ".parquet"])
 def write(request, tmp_path):
     def write(frame):
-        path = tmp_path / f"log{request.param}"
-        if path.suffix == ".parquet":
-            frame.to_parquet(path)
-        else:
-            frame.to_csv(path, index=False)
-        return path
+        if request.param == ".csv":
+            return csv(tmp_path, frame)
+        frame.to_parquet(tmp_path / "log.parquet")
+        return tmp_path / "log.parquet"
 
     return write
 

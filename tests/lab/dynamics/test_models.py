@@ -7,7 +7,7 @@ import torch
 from objectives.losses import Networks, make_batch
 from tensordict import TensorDict
 from torch import nn
-from uneven_dynamics import linear_dynamics, plain_gaussian
+from uneven_dynamics import compare_models, linear_dynamics, plain_gaussian
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, TransitionVAELoss
 from torchrl_osr.lab.dynamics.models import has_next_state
@@ -88,12 +88,7 @@ def test_loss_equals_the_plain_likelihood(check, num_cells) -> None:
     loss = DynamicsLoss(model)
     value = sum(loss(batch).values())
     wanted = plain_loss(plain, batch)
-    check(
-        "Dynamics ensemble",
-        [value.detach(), *torch.autograd.grad(value, list(model.parameters()))],
-        [wanted.detach(), *torch.autograd.grad(wanted, list(plain.parameters()))],
-        tolerance=1e-10,
-    )
+    compare_models(check, "Dynamics ensemble", (value, model), (wanted, plain))
 
 
 def test_weights_alone_decay_and_by_their_layer() -> None:
@@ -133,12 +128,7 @@ def test_loss_of_the_autoencoder_equals_the_plain_objective(transitions, check) 
         divergence = (variance + mean**2 - 1 - 2 * log_scale).sum() / 2
         total = total + ((out - target) ** 2).mean() + 0.5 * divergence / 6
     wanted = total / len(kept)
-    check(
-        "Transition VAE",
-        [value.detach(), *torch.autograd.grad(value, list(model.parameters()))],
-        [wanted.detach(), *torch.autograd.grad(wanted, list(plain.parameters()))],
-        tolerance=1e-10,
-    )
+    compare_models(check, "Transition VAE", (value, model), (wanted, plain))
 
 
 @pytest.mark.parametrize("name", ["dynamics", "vae"])

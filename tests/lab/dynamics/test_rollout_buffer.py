@@ -45,8 +45,7 @@ def test_batches_have_the_share_of_real_rows_and_the_newest_generations(data) ->
     for number in range(12):
         nn.init.constant_(buffer.policy.weight, float(number))
         state = buffer.sample()["state"]
-        assert len(state) == 40
-        assert int((state == -1).sum()) == 10
+        assert (len(state), int((state == -1).sum())) == (40, 10)
         found.append({*state.floor().int().flatten().tolist()} - {-1})
     # Rolled out before batches 0, 3, 6, 9; the last two are kept.
     assert found == [{0}] * 3 + [{0, 3}] * 3 + [{3, 6}] * 3 + [{6, 9}] * 3
@@ -57,10 +56,8 @@ def buffer_of(data: ModelData, options: DynamicsOptions, **batches):
     """Return a buffer of rollouts, a batch, the untrained model and the actor."""
     torch.manual_seed(0)
     model, actor = options.ensemble(11, 3), deterministic_actor(11, 3, num_cells=[8])
-    batches = {"batch_size": 8, "n_steps": 1} | batches
-    buffer = RolloutReplayBuffer(
-        options, data, model, actor, transform=lambda batch: batch, **batches
-    )
+    batches = {"batch_size": 8, "n_steps": 1, "transform": lambda each: each} | batches
+    buffer = RolloutReplayBuffer(options, data, model, actor, **batches)
     return buffer, buffer.sample(), model, actor
 
 

@@ -123,8 +123,5 @@ def test_other_tasks_end_beyond_the_states_from_which_they_go_on(capsys) -> None
     assert "the task ends where observation[0] > 8.9" in said  # 10 s + 1
     assert task_limits(walks(lambda where: where > 2)).isinf().all()
     assert "the task ends never" in capsys.readouterr().out
-
-
-def test_ends_inside_the_range_are_no_limits() -> None:
     with pytest.raises(ValueError, match="0% of the log's ends .* expected 90 %"):
         task_limits(walks(lambda where: where.abs() < 0.1))  # a goal

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lab.envs.recorder import Recorder, play
 
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.envs import (
@@ -31,14 +32,14 @@ def executed(env, actions):
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), max_size=12), st.integers(0, 9))
-def test_delay_shifts_the_actions(recorder, sent, steps):
-    env = ActionDelay(recorder(), steps)
+def test_delay_shifts_the_actions(sent, steps):
+    env = ActionDelay(Recorder(), steps)
     for _ in range(2):  # nothing is left over from one episode to the next
         assert executed(env, sent) == ([0.0] * steps + sent)[: len(sent)]
 
 
-def test_actions_are_copied(recorder):
-    env = ActionDelay(recorder(), 1)
+def test_actions_are_copied():
+    env = ActionDelay(Recorder(), 1)
     env.reset(seed=0)
     buffer = np.full(2, 0.5)
     env.step(buffer)
@@ -47,8 +48,8 @@ def test_actions_are_copied(recorder):
     assert (env.unwrapped.actions[1] == 0.5).all()
 
 
-def test_observation_noise_has_the_stated_deviation(play, recorder):
-    env = ObservationNoise(recorder(sensors=3), 0.2, unit=[1.0, 0.5, 0.0])
+def test_observation_noise_has_the_stated_deviation():
+    env = ObservationNoise(Recorder(sensors=3), 0.2, unit=[1.0, 0.5, 0.0])
     observations = np.array([step[0] for step in play(env, DRAWS)])
     # The recorder observes the number of the step.
     noise = observations - np.arange(1, DRAWS + 1)[:, None]

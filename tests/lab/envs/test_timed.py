@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lab.envs.recorder import Recorder, play
 
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.envs import ActionKnock, DynamicsChange, ExternalPush
+
+MODES = st.sampled_from(["official", "paper", "torque"])
 
 
 def column(steps, index):
@@ -20,10 +23,10 @@ def flags(steps):
     return [step[-1]["disturbed"] for step in steps]
 
 
-def test_official_by_hand(play, recorder):
+def test_official_by_hand():
     # Steps 1, 2, 3 are the agent's, 4 to 8 the knock's, 9 and 10 the agent's again. It
     # falls in step 5, within the knock, which nobody hears of, and in step 10.
-    env = ActionKnock(recorder(falls=[5, 10]), 5, mode="official", at=3)
+    env = ActionKnock(Recorder(falls=[5, 10]), 5, mode="official", at=3)
     played = play(env, 5)
     assert [float(step[0][0]) for step in played] == [1, 2, 8, 9, 10]
     assert column(played, 1) == [1, 2, 3, 9, 10]
@@ -32,8 +35,8 @@ def test_official_by_hand(play, recorder):
 
 
 @pytest.mark.parametrize("fall", [2, 3])
-def test_official_spares_who_fell_before(fall, play, recorder):
-    bare = recorder(falls=[fall])
+def test_official_spares_who_fell_before(fall):
+    bare = Recorder(falls=[fall])
     env = ActionKnock(bare, 5, mode="official", at=3)
     played = play(env, fall)
     assert played[-1][2]
@@ -89,8 +92,8 @@ def test_official_is_the_released_sampler(name):
 
 
 @pytest.mark.parametrize("mode", ["paper", "torque"])
-def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
-    bare = recorder(falls=[9])
+def test_counted_modes_replace_the_agents_actions(mode):
+    bare = Recorder(falls=[9])
     played = play(ActionKnock(bare, 3, mode=mode, at=4), 9)
     own = [(action == 0.5).all() for action in bare.actions]
     assert own == [True] * 4 + [False] * 3 + [True] * 2
@@ -102,16 +105,11 @@ def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
         assert set(np.unique(bare.actions[4:7])) == {-1, 1}
 
 
-@given(
-    st.integers(1, 30),
-    st.integers(1, 20),
-    st.integers(0, 2**40),
-    st.sampled_from(["official", "paper", "torque"]),
-)
+@given(st.integers(1, 30), st.integers(1, 20), st.integers(0, 2**40), MODES)
 @settings(deadline=None, max_examples=25)
-def test_moments_lie_in_the_window_and_follow_seeds(recorder, start, width, seed, mode):
+def test_moments_lie_in_the_window_and_follow_seeds(start, width, seed, mode):
     window = (start, start + width)
-    env = ActionKnock(recorder(), 2, mode=mode, at=window)
+    env = ActionKnock(Recorder(), 2, mode=mode, at=window)
     moments = []
     for _ in range(2):
         env.reset(seed=seed)
@@ -123,7 +121,7 @@ def test_moments_lie_in_the_window_and_follow_seeds(recorder, start, width, seed
     assert moments[0] == moments[1]
 
 
-def test_force_is_applied_and_removed(play):
+def test_force_is_applied_and_removed():
     env = ExternalPush(make_environment("Hopper-v5"), 0.5, duration=3, at=2)
     bare, seen = env.unwrapped, []
     step = bare.step

@@ -37,10 +37,8 @@ def test_who_falls_from_each_state_is_what_the_environment_says() -> None:
     bare = env.unwrapped
     rng = np.random.default_rng(0)
     # More than are played at once; some fall and some do not.
-    states = [
-        (bare.init_qpos, bare.init_qvel + 2.0 * rng.standard_normal(9))
-        for _ in range(20)
-    ]
+    pushes = 2.0 * rng.standard_normal((20, 9))
+    states = [(bare.init_qpos, bare.init_qvel + push) for push in pushes]
 
     def policy(observation: Tensor) -> Tensor:
         # Rounds in the same way whatever the number of rows: falls are chaotic.

@@ -80,9 +80,8 @@ def measure(disturbed: Trajectory, clean: Trajectory | None = None):
 def test_one_episode(after, fell, survived, alive, steps):
     before = [1.0, 1.0, 4.0]
     recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
-    assert recovery["survived_knock"] == survived
-    assert recovery["alive_after"] == alive
-    assert recovery["recovery_steps"] == steps
+    names = "survived_knock", "alive_after", "recovery_steps"
+    assert [recovery[name] for name in names] == [survived, alive, steps]
 
 
 def test_the_first_disturbance_counts_if_there_is_one():

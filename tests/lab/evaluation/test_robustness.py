@@ -118,9 +118,8 @@ def test_an_environment_that_ignores_its_seed_warns():
 def play(*disturbances: Disturbance, policy, episodes: int = 4):
     rows = torch.randn(500, 11, generator=torch.Generator().manual_seed(0))
     distance = DataDistance(TensorDict({"observation": rows}, [500]))
-    return evaluate_paired(
-        policy, "Hopper-v5", disturbances, distance, num_episodes=episodes, seed=7
-    )
+    given = {"num_episodes": episodes, "seed": 7}
+    return evaluate_paired(policy, "Hopper-v5", disturbances, distance, **given)
 
 
 def test_strength_zero_is_the_clean_episodes_bit_for_bit():

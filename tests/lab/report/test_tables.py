@@ -34,17 +34,15 @@ def test_scores_are_means_of_the_last_evaluations(tmp_path):
 
 def test_the_untrained_policy_is_in_no_mean(tmp_path):
     fakes.write_run(tmp_path / "a", {0: [90.0], 1: [10.0], 2: [20.0]})
-    tables = fakes.read_all(tmp_path)
-    row = score_table(tables).loc[PLACE, "osr"]
+    row = score_table(fakes.read_all(tmp_path)).loc[PLACE, "osr"]
     assert row["mean of the last 5"].mean == pytest.approx(15)
 
 
 def test_a_start_state_that_comes_again_is_no_new_episode(tmp_path):
     once, again = [fakes.level("x", [1.0, 2.0])], [fakes.level("x", [3.0, 6.0])]
     for name, seeds, wanted in (("same", [1, 2], 2), ("other", [3, 4], 4)):
-        content = fakes.suite_of(
-            (8, [1, 2], [10.0, 20.0], once), (9, seeds, [30.0, 40.0], again)
-        )
+        last = 9, seeds, [30.0, 40.0], again
+        content = fakes.suite_of((8, [1, 2], [10.0, 20.0], once), last)
         fakes.write_run(tmp_path / name, {9: [1.0]}, suite=content)
         rows = fakes.read_all(tmp_path / name).episodes
         (scores,) = by_run(rows[rows["disturbance"] == "x"])

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from composed import CONF, composed, configured
+from composed import composed, configured, options
 from gymnasium.spaces import Box
 from hydra.utils import get_class
 from objectives.losses import make_batch
@@ -16,8 +16,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr.lab.run.build import make_learner, try_out
 from torchrl_osr.lab.run.config import checked
-
-LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 
 
 def learner_of(*overrides: str):
@@ -35,7 +33,7 @@ def batch():
     return batch.apply(lambda x: x.float() if x.is_floating_point() else x)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", options("loss"))
 def test_every_loss_is_built_and_trains_its_networks(name, batch) -> None:
     config, learner = learner_of(f"loss={name}")
     actor, model, loss, _ = learner

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 
 import pytest
-import yaml
 from composed import composed
 from omegaconf import OmegaConf
 
@@ -54,8 +53,7 @@ def test_keys_that_were_added_are_refused(key):
 )
 def test_wrong_values_of_a_foreign_run_are_named(tmp_path, key, value, reason):
     write_config(tmp_path, checked(composed("train")))
-    path = tmp_path / "config.yaml"
-    cfg = OmegaConf.create(yaml.safe_load(path.read_text()))
+    cfg = OmegaConf.load(path := tmp_path / "config.yaml")
     OmegaConf.update(cfg, key, value)
     OmegaConf.save(cfg, path)
     with pytest.raises(ValueError, match=reason):

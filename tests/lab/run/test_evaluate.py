@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from composed import CONF, evaluating, trained
+from composed import evaluating, options, trained
 
 from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import deterministic_policy
@@ -16,8 +16,6 @@ from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, reco
 from torchrl_osr.lab.run.config import read_run, write_config
 from torchrl_osr.lab.run.evaluate import UnitActions, evaluate_run, make_disturbances
 from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
-
-SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +68,7 @@ def test_results_are_kept_with_what_decides_them(folder, capsys, monkeypatch):
 
 
 def test_every_suite_is_built():
-    for name in SUITES:
+    for name in options("evaluation/suite"):
         suite = evaluating(f"suite={name}").suite
         assert suite.name == name
         made = make_disturbances(suite.disturbances, np.full(11, 0.5))

@@ -131,9 +131,7 @@ def test_a_process_of_another_machine_may_still_run(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "code"), [("TERM", 75), ("HUP", 75), ("INT", 130)])
-def test_a_signal_outside_of_the_training_ends_the_run_in_order(
-    tmp_path, caplog, name, code
-):
+def test_a_signal_outside_of_training_ends_a_run_in_order(tmp_path, caplog, name, code):
     def stop():
         os.kill(os.getpid(), signal.Signals[f"SIG{name}"])
         pytest.fail("not reached")

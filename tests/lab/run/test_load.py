@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel
@@ -74,12 +73,10 @@ def test_the_policy_is_the_average_of_its_weights(tmp_path):
     average = AveragedModel(actor)
     for parameter in average.parameters():
         parameter.data.add_(1.0)
-    checkpoint = safe_checkpoint(
-        loss_module=loss,
-        observation_norm=load_trained(folder).observation_norm,
-        policy_average=average,
-    )
-    CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=1000)
+    parts = {"loss_module": loss, "policy_average": average}
+    parts["observation_norm"] = load_trained(folder).observation_norm
+    rotation = CheckpointRotation(folder / CHECKPOINTS, keep_last=2)
+    rotation.save(safe_checkpoint(**parts), step=1000)
     trained = load_trained(folder)
     for holder in (trained.actor, trained.loss.actor_network_params):
         pairs = zip(holder.parameters(), average.parameters(), strict=True)
@@ -95,8 +92,7 @@ def test_the_policy_is_the_average_of_its_weights(tmp_path):
 )
 def test_a_configuration_of_another_run_is_refused(tmp_path, key, value, shapes):
     make_run(folder := tmp_path / "run")
-    path = folder / "config.yaml"
-    cfg = OmegaConf.create(yaml.safe_load(path.read_text()))
+    cfg = OmegaConf.load(path := folder / "config.yaml")
     OmegaConf.update(cfg, key, value)
     OmegaConf.save(cfg, path)
     wanted = f"is {shapes[0]} in the file, {shapes[1]} here"

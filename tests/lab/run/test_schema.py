@@ -6,7 +6,7 @@ import inspect
 from dataclasses import fields
 
 import pytest
-from composed import CONF, composed
+from composed import CONF, composed, options
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
@@ -22,10 +22,6 @@ from torchrl_osr.lab.run.schema import LOSSES, TrainConfig, schema_of
 GROUPS = ("data", "inverse_dynamics", "dynamics", "recovery", "logger", "preset")
 
 
-def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-
-
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_option_of_a_group_composes(group):
     for name in options(group):
@@ -35,13 +31,10 @@ def test_every_option_of_a_group_composes(group):
 
 @pytest.mark.parametrize("name", options("experiment"))
 def test_every_experiment_sweeps_over_values_that_compose(name):
-    raw = OmegaConf.load(CONF / "experiment" / f"{name}.yaml")
+    raw, given = OmegaConf.load(CONF / f"experiment/{name}.yaml"), f"+experiment={name}"
     for key, values in raw.hydra.sweeper.params.items():
         overrides = [f"{key}={value}" for value in str(values).split(",")]
-        found = {
-            str(checked(composed("train", f"+experiment={name}", each)))
-            for each in overrides
-        }
+        found = {str(checked(composed("train", given, each))) for each in overrides}
         assert len(found) == len(overrides)
 
 

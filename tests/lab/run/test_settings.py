@@ -10,7 +10,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from composed import CONF, composed
+from composed import composed, options
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.data.environment import known_ids
@@ -24,7 +24,7 @@ KEYS = (
 )
 """Columns of the table. Those of ``dynamics`` are blank without a model."""
 
-METHODS = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
+METHODS = options("loss")
 ENVS = ("hopper", "walker2d", "halfcheetah")
 DATA = [(env, f"medium-{kind}") for kind in ("expert", "replay") for env in ENVS]
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from composed import trained
+from recorded_logs import make_columns, save
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_osr import load_policy
@@ -38,9 +39,8 @@ def test_the_last_and_the_best_policy_are_exported(folder):
         run = load_trained(checkpoint)
         assert policy.record["source"]["step"] == run.step == step
         there = deterministic_policy(run.actor, run.observation_norm)
-        np.testing.assert_allclose(
-            policy.act(state), there(torch.as_tensor(state)).numpy(), atol=1e-6
-        )
+        wanted = there(torch.as_tensor(state)).numpy()
+        np.testing.assert_allclose(policy.act(state), wanted, atol=1e-6)
 
 
 def test_tensorboard_has_the_numbers_of_the_csv_files(folder):
@@ -53,16 +53,11 @@ def test_tensorboard_has_the_numbers_of_the_csv_files(folder):
 
 
 def test_r2_of_a_constant_action_is_null_in_the_file_and_a_dash(tmp_path, capsys):
-    rng = np.random.default_rng(0)
-    np.savez(
-        tmp_path / "log.npz",
-        observation=rng.normal(size=(600, 11)),
-        action=rng.uniform(-0.9, 0.9, (600, 3)) * [1, 0, 1],
-        reward=rng.normal(size=600),
-        terminated=np.zeros(600, bool),
-        truncated=np.arange(600) % 50 == 49,
-    )
-    folder = trained(tmp_path / "run", "data=file", f"data.path={tmp_path}/log.npz")
+    rng, columns = np.random.default_rng(0), make_columns(600)
+    columns["observation"] = rng.normal(size=(600, 11))
+    columns["action"] = rng.uniform(-0.9, 0.9, (600, 3)) * [1, 0, 1]
+    log = save(tmp_path / "log.npz", columns)
+    folder = trained(tmp_path / "run", "data=file", f"data.path={log}")
     results = json.loads((folder / "inverse_dynamics.json").read_text())
     assert results["r2"][1] is None
     assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d\n", capsys.readouterr().out)

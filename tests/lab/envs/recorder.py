@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gymnasium
 import numpy as np
-import pytest
 
 
 class Recorder(gymnasium.Env):
@@ -33,20 +32,8 @@ class Recorder(gymnasium.Env):
         return np.full(self.observation_space.shape, float(len(self.actions)))
 
 
-@pytest.fixture(scope="session")
-def recorder():
-    """Return the class, for any number of environments."""
-    return Recorder
-
-
-@pytest.fixture(scope="session")
-def play():
-    """Return a function that plays ``steps`` steps and returns what they returned."""
-
-    def run(env, steps, *, seed=0, action=None):
-        env.reset(seed=seed)
-        if action is None:
-            action = np.full(env.action_space.shape, 0.5, np.float32)
-        return [env.step(action) for _ in range(steps)]
-
-    return run
+def play(env, steps):
+    """Play ``steps`` steps with actions of 0.5; return what they returned."""
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.5, np.float32)
+    return [env.step(action) for _ in range(steps)]
