@@ -12,12 +12,6 @@ from torch.distributions import Categorical, Normal, kl_divergence
 
 from torchrl_osr import functional
 
-# The pair of the golden numbers: inverse dynamics N(.4, .3), policy N(-.2, .5).
-INVERSE_DYNAMICS = (0.4, 0.3)
-POLICY = (-0.2, 0.5)
-# By hand: log(.5/.3) + (.09 + .36)/.5 - .5, and log(.3/.5) + (.25 + .36)/.18 - .5.
-FORWARD, REVERSE = 0.910826, 2.378063
-
 locations = st.floats(-3, 3)
 scales = st.floats(0.05, 3)
 
@@ -26,10 +20,12 @@ def tensors(*numbers: float) -> list[torch.Tensor]:
     return [torch.tensor([number], dtype=torch.float64) for number in numbers]
 
 
-PAIR, WIDE, EQUAL = (*POLICY, *INVERSE_DYNAMICS), (0.5, 1e3, 0, 1), (1, 0.5, 0.4, 0.5)
-# WIDE: log(1e3) + 1.25/2e6 - .5, where printed (12) is -6.9. EQUAL: .6^2 / (2 * .5^2).
-HAND = [(PAIR, "forward", FORWARD), (PAIR, "reverse", REVERSE)]
-HAND += [(WIDE, "forward", 6.407756), (EQUAL, "forward", 0.72)]
+# By hand, policy first. PAIR: log(.5/.3) + (.09 + .36)/.5 - .5, and log(.3/.5) +
+# (.25 + .36)/.18 - .5. Then log(1e3) + 1.25/2e6 - .5, where printed (12) is -6.9, and
+# .6^2 / (2 * .5^2).
+PAIR = (-0.2, 0.5, 0.4, 0.3)
+HAND = [(PAIR, "forward", 0.910826), (PAIR, "reverse", 2.378063)]
+HAND += [((0.5, 1e3, 0, 1), "forward", 6.407756), ((1, 0.5, 0.4, 0.5), "forward", 0.72)]
 
 
 @pytest.mark.parametrize(("numbers", "direction", "expected"), HAND)
@@ -70,16 +66,11 @@ def test_categorical_kl_of_actions_that_are_never_taken(p, q, expected) -> None:
 
 # Actions (log 2, log 6) over densities (1/2, 2): log(4 + 3), and at temperature 2 the
 # values by square roots and the densities as they are, 2 log(2 sqrt 2 + sqrt(6) / 2).
-SOFT_MAXIMUM = [(1.0, 1.945910), (2.0, 2.799000)]
-
-
-@pytest.mark.parametrize(("temperature", "expected"), SOFT_MAXIMUM)
-def test_soft_maximum_divides_by_densities_at_every_temperature(
-    temperature, expected
-) -> None:
+def test_soft_maximum_divides_by_densities_at_every_temperature() -> None:
     qvalue, log_prob = torch.tensor([[2.0, 6.0], [0.5, 2.0]]).double().log()
-    value = functional.soft_maximum(qvalue, log_prob, temperature=temperature)
-    assert value.item() == pytest.approx(expected, abs=1e-6)
+    for temperature, expected in ((1.0, 1.945910), (2.0, 2.799000)):
+        value = functional.soft_maximum(qvalue, log_prob, temperature=temperature)
+        assert value.item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_constraint_has_a_floor_with_cqls_soft_maximum_alone() -> None:

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchrl_osr.functional import value_constraint
 
 PROBLEMS, STATES, ACTIONS = 2000, 5, 3
-ALPHA = 5.0
 
 
 def simplex(*shape: int) -> Tensor:
@@ -57,15 +56,11 @@ def problems(shift: float = 0.3) -> SimpleNamespace:
     off_dynamics = (1 - shift) * dynamics + shift * simplex(*shape, STATES)
     next_state = next_states(behaviour, dynamics)
     return SimpleNamespace(
-        behaviour=behaviour,
-        off_behaviour=off_behaviour,
-        policy=policy,
-        dynamics=dynamics,
-        off_dynamics=off_dynamics,
-        next_state=next_state,
+        behaviour=behaviour, off_behaviour=off_behaviour, policy=policy,
+        dynamics=dynamics, off_dynamics=off_dynamics, next_state=next_state,
         target=averaged_model(next_state, off_behaviour, off_dynamics),
         qvalue=torch.randn(*shape, dtype=torch.float64),
-    )
+    )  # fmt: skip
 
 
 def test_proposition_2_at_the_data_the_model_is_the_behaviour_policy() -> None:

@@ -127,13 +127,10 @@ def test_autocast_rounds_products_alone(options):
 
 def test_second_derivatives_and_broken_promises_are_refused():
     shapes = [(1, 4, 5), (1, 4)], [(1, 1, 4), (1, 1)]
-    layers = [
-        tuple(torch.randn(each, requires_grad=True) for each in layer)
-        for layer in shapes
-    ]
+    layers = [[torch.randn(x, requires_grad=True) for x in each] for each in shapes]
     rows = torch.randn(6, 3), torch.randn(2, 6, 2), torch.randn(2, 6)
     given = [2, 2], [], 1.0, None, *rows
-    value = critics._SoftMaximum.apply(True, given, *sum(layers, ()))
+    value = critics._SoftMaximum.apply(True, given, *layers[0], *layers[1])
     with pytest.raises(RuntimeError, match="no second derivatives"):
         torch.autograd.grad(value.sum(), layers[0][0], create_graph=True)
     with pytest.raises(RuntimeError, match="do not weigh alike"):

@@ -9,12 +9,7 @@ import pytest
 import torch
 from objectives.losses import A, Networks, S, make_batch, make_loss, make_networks
 from tensordict import TensorDict
-from tensordict.nn import (
-    InteractionType,
-    TensorDictModule,
-    TensorDictParams,
-    set_interaction_type,
-)
+from tensordict.nn import InteractionType, TensorDictModule, set_interaction_type
 from torch import nn
 from torchrl.objectives import LossModule
 
@@ -115,14 +110,8 @@ def test_another_kind_of_batch_runs_the_loss_itself():
 # -- state that changes outside of the traced operations ------------------------------
 
 
-def freeze(loss) -> None:
-    next(loss.actor_network_params.parameters()).requires_grad_(False)
-
-
-def move(loss) -> None:
-    """Give a parameter other memory."""
-    parameter = next(loss.actor_network_params.parameters())
-    parameter.data = 2 * parameter.data
+def first(loss) -> nn.Parameter:
+    return next(loss.actor_network_params.parameters())
 
 
 CHANGES = {
@@ -130,8 +119,8 @@ CHANGES = {
     "key": lambda loss: loss.set_keys(reward="other"),
     "gamma": lambda loss: loss.make_value_estimator(gamma=0.5),
     "gamma in place": lambda loss: loss.value_estimator.gamma.fill_(0.5),
-    "requires_grad": freeze,
-    "memory": move,
+    "requires_grad": lambda loss: first(loss).requires_grad_(False),
+    "memory": lambda loss: setattr(first(loss), "data", 2 * first(loss).data),
     "hook": lambda loss: loss.register_forward_hook(lambda *each: each[2] * 2),
     "eval": lambda loss: loss.eval(),
 }
@@ -169,8 +158,8 @@ class Regression(LossModule):
     """A loss of the user's own, with a state that its forward may change."""
 
     network: TensorDictModule
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
+    network_params: nn.Module
+    target_network_params: nn.Module
 
     def __init__(self, kind: str) -> None:
         super().__init__()
@@ -211,16 +200,10 @@ KINDS = ["dropout", "assigned", "in place", "schedule", "batch norm", "deciding"
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_loss_with_a_state_of_its_own_is_not_frozen(kind, caplog):
-    losses = Regression(kind), Regression(kind)
-    plain, traced = (
-        LossGradients(each, trace=each is losses[1], warm_up=3) for each in losses
-    )
+    one, other, batch = Regression(kind), Regression(kind), make_batch("osr", 6)
+    plain, traced = LossGradients(one, trace=False), LossGradients(other, warm_up=3)
     for _ in range(30):
-        batch = make_batch("osr", 6)
-        found = [
-            results(gradients, loss, batch)
-            for gradients, loss in zip((traced, plain), losses[::-1], strict=True)
-        ]
+        found = results(traced, other, batch), results(plain, one, batch)
         assert_same_bits(*found)
     assert (traced.trace is not None) == (kind == "dropout")
     assert ("runs without a trace" in caplog.text) != (kind == "dropout")

@@ -7,15 +7,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import GymEnv
 
-from torchrl_osr.modules import (
-    categorical_actor,
-    deterministic_actor,
-    gaussian_actor,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
+from torchrl_osr import modules
 
-BOUNDED = [tanh_gaussian_actor, tanh_gaussian_inverse_dynamics]
+BOUNDED = [modules.tanh_gaussian_actor, modules.tanh_gaussian_inverse_dynamics]
 BOUNDS = [(-0.4, 0.4), (torch.tensor([-1.0, 0.0]), torch.tensor([2.0, 3.0]))]
 
 
@@ -25,7 +19,7 @@ def states(*size: int, scale: float = 1.0) -> TensorDict:
     return TensorDict({"observation": observation, "next": next_states}, size)
 
 
-@pytest.mark.parametrize("build", [*BOUNDED, deterministic_actor])
+@pytest.mark.parametrize("build", [*BOUNDED, modules.deterministic_actor])
 @pytest.mark.parametrize(("low", "high"), BOUNDS)
 def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> None:
     # Inputs of this size saturate the tanh at both ends.
@@ -38,7 +32,7 @@ def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> Non
     assert (action.amax(0) > high - 0.1 * width).all()
 
 
-@pytest.mark.parametrize("build", [*BOUNDED, deterministic_actor])
+@pytest.mark.parametrize("build", [*BOUNDED, modules.deterministic_actor])
 def test_an_untrained_actor_acts_near_the_center(build) -> None:
     action = build(5, 2, num_cells=[8], low=0.0, high=100.0)(states(500))["action"]
     assert 35 < action.mean() < 65
@@ -52,7 +46,7 @@ def test_scale_has_a_floor(build) -> None:
 
 
 def test_mean_of_a_gaussian_is_bounded_and_its_scale_is_learned() -> None:
-    out = gaussian_actor(5, 2, num_cells=[8])(states(4, scale=100))
+    out = modules.gaussian_actor(5, 2, num_cells=[8])(states(4, scale=100))
     assert (out["loc"].abs() <= 1).all()
     assert (out["scale"] == 1).all()
     assert out["scale"].requires_grad
@@ -60,6 +54,6 @@ def test_mean_of_a_gaussian_is_bounded_and_its_scale_is_learned() -> None:
 
 def test_categorical_actor_plays_a_gymnasium_task_as_torchrl_gives_it() -> None:
     env = GymEnv("CartPole-v1")
-    rollout = env.rollout(5, categorical_actor(4, 2, num_cells=[8]))
+    rollout = env.rollout(5, modules.categorical_actor(4, 2, num_cells=[8]))
     assert env.action_spec.is_in(rollout["action"][0].to(env.action_spec.dtype))
     env.close()

@@ -15,9 +15,7 @@ def test_critics_have_torchs_default_initialisation() -> None:
     critics = critic_ensemble(S, A, num_cells=[400])
     torch.manual_seed(3)
     for critic in critics:
-        for name, layer in (
-            ("0", torch.nn.Linear(S + A, 400)),
-            ("2", torch.nn.Linear(400, 1)),
-        ):
+        layers = torch.nn.Linear(S + A, 400), torch.nn.Linear(400, 1)
+        for name, layer in zip("02", layers, strict=True):
             weight = critic.module.get_parameter(f"{name}.weight")
             assert torch.equal(weight, layer.weight)

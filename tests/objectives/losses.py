@@ -18,15 +18,8 @@ from torch.distributions import Categorical, Normal
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_osr import (
-    CQLLoss,
-    DiscreteOSRLoss,
-    InverseDynamicsLoss,
-    OSRLoss,
-    OSRVLoss,
-    StateRecoveryLoss,
-    modules,
-)
+import torchrl_osr as osr
+from torchrl_osr import modules
 from torchrl_osr.lab import losses as lab
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives import WithRecovery
@@ -145,7 +138,7 @@ def combined(term: Callable[..., LossModule]):
     def build(networks: Networks, **options: Any) -> WithRecovery:
         names = ("reduction", "use_prioritized_weights")
         shared = {name: options[name] for name in names if name in options}
-        cql = CQLLoss(networks.actor, networks.critics, **(SMALL | options))
+        cql = osr.CQLLoss(networks.actor, networks.critics, **(SMALL | options))
         return WithRecovery(cql, term(networks, **shared))
 
     return build
@@ -158,6 +151,7 @@ ACTOR, CRITICS, MODEL, VALUE = (
 TD3 = {"loss_actor": ACTOR, "loss_qvalue": CRITICS}
 SAC = {"loss_actor": ACTOR, "loss_alpha": "log_alpha", "loss_qvalue": CRITICS}
 CQL = SAC | {"loss_cql": CRITICS}
+GAP = CQL | {"loss_alpha_prime": "log_alpha_prime"}
 SDC = CQL | {"loss_deviation": ACTOR, "loss_multiplier": "log_multiplier"}
 RECOVERY, FIT = {"loss_recovery": ACTOR}, {"loss_inverse_dynamics": MODEL}
 SMALL = {"alpha_init": 0.5, "num_random": 3}
@@ -170,31 +164,29 @@ PAIR, TRIPLE, BOX = "actor critics", "actor critics model", {"low": -1.0, "high"
 DISCRETE, PLAIN = "chooser choice_critics choice_model", "module critics"
 
 LOSSES: dict[str, Case] = {
-    "cql": Case(of(CQLLoss, PAIR, **SMALL), CQL),
-    "cql-options": Case(
-        of(CQLLoss, PAIR, **EVERY_OPTION), CQL | {"loss_alpha_prime": "log_alpha_prime"}
-    ),
-    "sac-n": Case(of(CQLLoss, PAIR, **SAC_N), SAC),
-    "osr": Case(of(OSRLoss, TRIPLE, **SMALL), CQL),
-    "osr-v": Case(of(OSRVLoss, TRIPLE, **SMALL), SAC),
-    "osr-v-cql": Case(of(OSRVLoss, TRIPLE, **SMALL, policy_values="cql"), SAC),
-    "discrete": Case(of(DiscreteOSRLoss, DISCRETE), CQL, "one_hot"),
+    "cql": Case(of(osr.CQLLoss, PAIR, **SMALL), CQL),
+    "cql-options": Case(of(osr.CQLLoss, PAIR, **EVERY_OPTION), GAP),
+    "sac-n": Case(of(osr.CQLLoss, PAIR, **SAC_N), SAC),
+    "osr": Case(of(osr.OSRLoss, TRIPLE, **SMALL), CQL),
+    "osr-v": Case(of(osr.OSRVLoss, TRIPLE, **SMALL), SAC),
+    "osr-v-cql": Case(of(osr.OSRVLoss, TRIPLE, **SMALL, policy_values="cql"), SAC),
+    "discrete": Case(of(osr.DiscreteOSRLoss, DISCRETE), CQL, "one_hot"),
     "discrete-cql": Case(
-        of(DiscreteOSRLoss, DISCRETE, recovery_weight=0.0), CQL, "index"
+        of(osr.DiscreteOSRLoss, DISCRETE, recovery_weight=0.0), CQL, "index"
     ),
-    "recovery": Case(of(StateRecoveryLoss, "actor model"), RECOVERY),
-    "recovery-delta": Case(of(StateRecoveryLoss, "delta model"), RECOVERY),
-    "recovery-module": Case(of(StateRecoveryLoss, "module model"), RECOVERY),
+    "recovery": Case(of(osr.StateRecoveryLoss, "actor model"), RECOVERY),
+    "recovery-delta": Case(of(osr.StateRecoveryLoss, "delta model"), RECOVERY),
+    "recovery-module": Case(of(osr.StateRecoveryLoss, "module model"), RECOVERY),
     "noisy-cloning": Case(
-        of(StateRecoveryLoss, "actor", recovery_target="data"), RECOVERY
+        of(osr.StateRecoveryLoss, "actor", recovery_target="data"), RECOVERY
     ),
     "official": Case(
-        combined(of(StateRecoveryLoss, "actor model", **RELEASED)), CQL | RECOVERY
+        combined(of(osr.StateRecoveryLoss, "actor model", **RELEASED)), CQL | RECOVERY
     ),
-    "model": Case(of(InverseDynamicsLoss, "model"), FIT),
-    "model-mse": Case(of(InverseDynamicsLoss, "model", loss_function="mse"), FIT),
-    "latent-model": Case(of(InverseDynamicsLoss, "latent_model"), FIT),
-    "choice-model": Case(of(InverseDynamicsLoss, "choice_model"), FIT, "one_hot"),
+    "model": Case(of(osr.InverseDynamicsLoss, "model"), FIT),
+    "model-mse": Case(of(osr.InverseDynamicsLoss, "model", loss_function="mse"), FIT),
+    "latent-model": Case(of(osr.InverseDynamicsLoss, "latent_model"), FIT),
+    "choice-model": Case(of(osr.InverseDynamicsLoss, "choice_model"), FIT, "one_hot"),
     "bc": Case(of(lab.BCLoss, "actor"), {"loss_actor": ACTOR}),
     "iql": Case(of(lab.IQLLoss, "gaussian critics value"), TD3 | {"loss_value": VALUE}),
     "fqe": Case(of(lab.FQELoss, "critics"), {"loss_qvalue": CRITICS}),
@@ -210,7 +202,7 @@ WITH_CRITICS = [name for name, case in LOSSES.items() if "loss_qvalue" in case.t
 WRAPPED = ["official", "sdc"]  # two losses of one actor, see WithRecovery
 every_loss = pytest.mark.parametrize("name", LOSSES)
 with_critics = pytest.mark.parametrize("name", WITH_CRITICS)
-ONE_BASE = [name for name in LOSSES if name not in WRAPPED]
+every_base = pytest.mark.parametrize("name", [x for x in LOSSES if x not in WRAPPED])
 
 
 def parts(loss: LossModule) -> list[LossModule]:
@@ -224,9 +216,7 @@ def make_networks(name: str, **options: Any) -> Networks:
     return Networks(**({"head": head} | options))
 
 
-def make_loss(
-    name: str, networks: Networks | None = None, **options: Any
-) -> LossModule:
+def make_loss(name: str, networks: Networks | None = None, **options) -> LossModule:
     """Return a loss of the table in float64; its target networks have an updater."""
     loss = LOSSES[name].build(networks or make_networks(name), **options).double()
     return update_targets(loss)

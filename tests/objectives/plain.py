@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -34,6 +33,8 @@ def prepare(loss: LossModule) -> LossModule:
             params.data.apply_(lambda each: each.mul_(TARGET_SCALE))
     if hasattr(part, "log_alpha"):  # whose logarithm was taken in float32
         part.log_alpha.data.fill_(math.log(ALPHA))
+    if hasattr(part, "log_alpha_prime"):
+        part.log_alpha_prime.data.fill_(LOG_PRIME)
     return loss
 
 
@@ -47,14 +48,12 @@ class Plain:
     """
 
     def __init__(self, networks: Networks, actor: str = "actor") -> None:
-        self.actor, self.critics = copy.deepcopy(
-            (getattr(networks, actor), networks.critics)
-        )
-        self.old_actor, self.targets = copy.deepcopy((self.actor, self.critics))
-        with torch.no_grad():
-            for network in (self.old_actor, *self.targets):
-                for parameter in network.parameters():
-                    parameter.mul_(TARGET_SCALE)
+        pair = getattr(networks, actor), networks.critics
+        self.actor, self.critics = copy.deepcopy(pair)
+        self.old_actor, self.targets = copy.deepcopy(pair)
+        for network in (self.old_actor, *self.targets):
+            for parameter in network.parameters():
+                parameter.data.mul_(TARGET_SCALE)
         self.log_alpha = torch.tensor(math.log(ALPHA), dtype=torch.float64)
         self.log_alpha.requires_grad_()
         low, high = (torch.as_tensor(b).double() for b in networks.bounds.values())
@@ -103,9 +102,7 @@ class Plain:
         }
 
     @torch.no_grad()
-    def soft_value(
-        self, batch: TensorDict, *, entropy: bool, number: int = 1
-    ) -> Tensor:
+    def soft_value(self, batch, *, entropy: bool, number: int = 1) -> Tensor:
         """Return what SAC's target bootstraps from, the best of a number, ``[R]``."""
         state, found = following(batch), []
         for noise in torch.randn(number, len(state), 2, dtype=torch.float64):
@@ -129,7 +126,7 @@ def following(batch: TensorDict) -> Tensor:
 
 
 K, LOG_PRIME, WEIGHT = 3, 0.4, 2.5
-DEFAULTS = {"temperature": 1.7, "min_q_weight": WEIGHT, "num_random": K}
+DEFAULTS = SOFT | {"temperature": 1.7, "min_q_weight": WEIGHT, "num_random": K}
 DEFAULTS |= {"clip_diff_min": -math.inf, "target_action_gap": None}
 DEFAULTS |= {"max_q_backup": False, "deterministic_backup": True}
 
@@ -140,8 +137,7 @@ class PlainCQL(Plain):
     def __init__(self, networks: Networks, **options) -> None:
         super().__init__(networks)
         self.options = DEFAULTS | options
-        self.log_prime = torch.tensor(LOG_PRIME, dtype=torch.float64)
-        self.log_prime.requires_grad_()
+        self.log_prime = torch.tensor(LOG_PRIME, dtype=torch.float64).requires_grad_()
 
     def losses(self, batch, states: Tensor) -> dict[str, Tensor]:
         """Return the losses with the policy's values on states ``[D, R, S]``."""
@@ -149,11 +145,9 @@ class PlainCQL(Plain):
         # The conservative term's actions are drawn before the target's.
         if self.options["min_q_weight"]:
             losses |= self.conservative_losses(batch)
-        value = self.soft_value(
-            batch,
-            entropy=not self.options["deterministic_backup"],
-            number=K if self.options["max_q_backup"] else 1,
-        )
+        entropy = not self.options["deterministic_backup"]
+        number = K if self.options["max_q_backup"] else 1
+        value = self.soft_value(batch, entropy=entropy, number=number)
         return losses | {"loss_qvalue": self.td_loss(batch, value)}
 
     @torch.no_grad()
@@ -197,13 +191,7 @@ class PlainCQL(Plain):
 
 
 def compare(
-    check: Callable[..., None],
-    label: str,
-    loss: LossModule,
-    batch: TensorDict,
-    restated: Callable[[], dict[str, Tensor]],
-    networks: dict[str, Any],
-    tolerance: float = 1e-12,
+    check, label: str, loss: LossModule, batch, restated, networks, tolerance=1e-12
 ) -> TensorDict:
     """Compare a loss with its restatement: values, and gradients of their sums.
 

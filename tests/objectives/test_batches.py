@@ -1,4 +1,4 @@
-"""What a loss does with a batch of any type and shape, with masks, weights and ends."""
+"""What a loss does with a batch: types, shapes, masks, weights, ends and targets."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from objectives.losses import (
     every_loss,
     make_batch,
     make_loss,
+    parts,
     record,
+    with_critics,
 )
+from torchrl.data.postprocs import MultiStep
 
-MASK, DONE = ("collector", "mask"), ("next", "done")
+MASK = ("collector", "mask")
 
 
 @every_loss
@@ -148,7 +151,7 @@ def test_next_state_of_ended_rows_changes_no_bit(name) -> None:
 @pytest.mark.parametrize("name", ["recovery", "model", "noisy-cloning"])
 def test_a_batch_of_ends_alone_gives_zeros(name) -> None:
     batch = make_batch(name, 5)
-    batch[DONE][:] = True
+    batch["next", "done"][:] = True
     assert not any(each.any() for each in record(make_loss(name), batch))
 
 
@@ -174,13 +177,11 @@ def test_actions_of_synthetic_rows_are_not_imitated(name, key) -> None:
     assert not torch.equal(call(loss, other)[key], call(loss, batch)[key])
 
 
-UNBOUNDED = ["discrete", "discrete-cql", "choice-model", "iql", "fqe"]
-READS_NONE = ["recovery", "recovery-delta", "recovery-module"]
 CONTINUOUS = [name for name in LOSSES if LOSSES[name].action == "continuous"]
-WITH_BOUNDS = [name for name in LOSSES if name not in (*UNBOUNDED, *READS_NONE)]
+READ = [name for name in CONTINUOUS if not name.startswith("recovery")]
 
 
-@pytest.mark.parametrize("name", WITH_BOUNDS)
+@pytest.mark.parametrize("name", sorted({*READ} - {"iql", "fqe"}))  # without bounds
 def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
     networks, batch = Networks(high=torch.tensor([1.0, 0.5])), make_batch(name, 10)
     options = {"high": [1.0, 0.5]} if name in ("td3-bc", "rebrac") else {}
@@ -200,10 +201,55 @@ def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
         make_loss(name, networks, **options)(batch)
 
 
-@pytest.mark.parametrize("name", sorted({*CONTINUOUS} - {*READS_NONE}))
+@pytest.mark.parametrize("name", READ)
 def test_actions_of_another_shape_are_named(name) -> None:
     """``[B]`` would broadcast where B is the number of dimensions."""
     loss, batch = make_loss(name), make_batch(name, 2)
     for shape in ((2,), (2, 1), (2, 3)):
         with pytest.raises(ValueError, match=r"'action' has shape \(2,"):
             loss(batch.clone().set("action", torch.zeros(shape)))
+
+
+@with_critics
+def test_target_follows_the_discount(name) -> None:
+    loss, batch, found = make_loss(name), make_batch(name, 2, 5), []
+    for gamma in (0.0, 0.5, 1.0):
+        loss.make_value_estimator(gamma=gamma)
+        found.append(call(loss, batch)["target_value"])
+    zero, half, one = found
+    torch.testing.assert_close(zero, batch["next", "reward"].mean())
+    torch.testing.assert_close(half, (zero + one) / 2)
+    with pytest.raises(NotImplementedError):
+        loss.make_value_estimator("tdlambda")
+
+
+@with_critics
+def test_a_return_of_one_step_changes_nothing(name) -> None:
+    loss, batch = make_loss(name), make_batch(name, 2, 5)
+    assert_same(record(loss, MultiStep(0.875, 1)(batch.clone())), record(loss, batch))
+
+
+# Those that read the next state as the one an action leads to, and the term that does.
+SINGLE = {"osr": "recovery_kl", "osr-v": "recovery_gap", "discrete": "recovery_kl"}
+SINGLE |= {"recovery": "loss_recovery", "official": "loss_recovery"}
+SINGLE |= {"model": "loss_inverse_dynamics"}
+
+
+@pytest.mark.parametrize(("name", "key"), SINGLE.items())
+def test_models_read_single_steps_kept_beside_those_of_several(name, key) -> None:
+    single = make_batch(name, 30, ends=False)
+    several = single.clone().set("next", single["next"].roll(1, 0))
+    several["steps_to_next_obs"] = torch.full((30, 1), 2)
+    several["next", "done"][:9] = True
+    loss = make_loss(name)
+    refused = r"multi-step .*\(2 steps\).*leave MultiStep out"
+    with pytest.raises(ValueError, match=refused):
+        loss(several)
+    both = several.clone().set("one_step", single["next"])
+    assert torch.equal(call(loss, both)[key], call(loss, single)[key])
+    if name in WITH_CRITICS:
+        parts(loss)[0].make_value_estimator(gamma=0.5)
+        found = call(loss, both)["target_value"]
+        parts(loss)[0].make_value_estimator(gamma=0.25)
+        several["steps_to_next_obs"].fill_(1)
+        torch.testing.assert_close(found, call(loss, several)["target_value"])

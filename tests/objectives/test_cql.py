@@ -13,30 +13,10 @@ import math
 
 import pytest
 import torch
-from objectives.losses import (
-    Networks,
-    call,
-    density,
-    make_batch,
-    make_loss,
-    update_targets,
-)
-from objectives.plain import (
-    ALPHA,
-    BOX,
-    DEFAULTS,
-    LOG_PRIME,
-    SOFT,
-    UNIT,
-    Plain,
-    PlainCQL,
-    compare,
-    prepare,
-)
+from objectives.losses import Networks, call, density, make_batch, make_loss
+from objectives.plain import ALPHA, BOX, DEFAULTS, UNIT, PlainCQL, compare, prepare
 from torch import Tensor
 from torch.distributions import kl_divergence
-
-from torchrl_osr import CQLLoss, OSRLoss
 
 RECOVERY_WEIGHT = 0.75
 ALL = {"clip_diff_min": 5.9, "target_action_gap": -1.0, "max_q_backup": True}
@@ -87,23 +67,16 @@ def test_losses_and_gradients_equal_the_restatement(check, variant, number) -> N
             found["loss_actor"] = found["loss_actor"] + recovery(plain, model, batch)
         return found
 
-    given = DEFAULTS | SOFT | options
-    parts = networks.actor, networks.critics
-    if recovers:
-        loss = OSRLoss(*parts, networks.model, recovery_weight=RECOVERY_WEIGHT, **given)
-    else:
-        loss = CQLLoss(*parts, **given)
-    loss = update_targets(loss.double())
-    if "target_action_gap" in options:
-        loss.log_alpha_prime.data.fill_(LOG_PRIME)
-    label = variant.partition(":")[0]
-    compare(check, label, prepare(loss), batch, restated, plain.networks)
+    weight = {"recovery_weight": RECOVERY_WEIGHT} if recovers else {}
+    given = DEFAULTS | options | weight
+    loss = make_loss("osr" if recovers else "cql", networks, **given)
+    compare(check, variant, prepare(loss), batch, restated, plain.networks)
 
 
 def test_released_variant_equals_the_restatement(check) -> None:
     networks, batch = Networks(**BOX), make_batch("osr", 10)
     plain, model = PlainCQL(networks), copy.deepcopy(networks.model)
-    loss = make_loss("official", networks, **(DEFAULTS | SOFT))
+    loss = make_loss("official", networks, **DEFAULTS)
     loss.recovery.recovery_weight = RECOVERY_WEIGHT
 
     def restated() -> dict[str, Tensor]:
@@ -111,13 +84,12 @@ def test_released_variant_equals_the_restatement(check) -> None:
         clean = batch["observation"].unsqueeze(0)
         return plain.losses(batch, clean) | {"loss_recovery": term}
 
-    label = "OSR, official variant"
-    compare(check, label, prepare(loss), batch, restated, plain.networks)
+    compare(check, "as released", prepare(loss), batch, restated, plain.networks)
 
 
 def test_metrics_and_priorities_are_what_they_are_called() -> None:
     networks, batch = Networks(), make_batch("cql", 10)
-    loss, plain = make_loss("cql", networks, **SOFT), Plain(networks)
+    loss, plain = make_loss("cql", networks, **DEFAULTS), PlainCQL(networks)
     assert loss.alpha.item() == pytest.approx(ALPHA), "alpha_init"
     assert loss.value_estimator.gamma.item() == pytest.approx(0.99)
     out = call(prepare(loss), batch)

@@ -28,14 +28,11 @@ def test_a_loop_over_critics_equals_vmap(name) -> None:
         assert_same(record(looped, batch), record(mapped, batch))
 
 
-# One loss for each path that is traced, for tracing takes seconds.
-TRACED = ["osr", "iql", "discrete"]
-
-
-# torch 2.13, tensordict 0.14.3 and TorchRL 0.14.1 warn of each other while they are
-# traced, and not at every time of the same things.
+# One loss for each path that is traced, for tracing takes seconds. torch 2.13,
+# tensordict 0.14.3 and TorchRL 0.14.1 warn of each other while they are traced, and not
+# at every time of the same things.
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", TRACED)
+@pytest.mark.parametrize("name", ["osr", "iql", "discrete"])
 def test_compiled_loss_equals_eager_without_graph_breaks(name) -> None:
     loss, batch = make_loss(name), make_batch(name, 10)
     eager = record(loss, batch)

@@ -29,11 +29,9 @@ def linear_gaussian(*inputs) -> ProbabilisticActor:
     )
     bound = torch.tensor(BOUND).double()
     return ProbabilisticActor(
-        network,
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
+        network, in_keys=["loc", "scale"], distribution_class=TanhNormal,
         distribution_kwargs={"low": -bound, "high": bound},
-    ).double()
+    ).double()  # fmt: skip
 
 
 def exact_draws(*size: int) -> Tensor:
@@ -106,20 +104,14 @@ def test_a_model_of_pushed_states_teaches_noisy_cloning(push, shuffled) -> None:
         after = rows["next", "observation"]
         rows["next", "observation"] = after[torch.randperm(len(rows))]
     fitted, clean = most_likely_model(rows, states), most_likely_model(rows, states[:1])
-    slopes = policy_gradient(
-        fitted, InverseDynamicsLoss(fitted)(rows)["loss_inverse_dynamics"]
-    )
-    assert slopes.abs().max() < 1e-9  # the package's own optimum
+    term = InverseDynamicsLoss(fitted)(rows)["loss_inverse_dynamics"]
+    assert policy_gradient(fitted, term).abs().max() < 1e-9  # the package's own optimum
     for _ in range(3):
         actor = linear_gaussian("observation")
         with torch.no_grad():
             actor[0][0].module[0].weight[1] = 0  # one standard deviation
-        cloning = [
-            -actor.get_dist(TensorDict({"observation": state}, [64])).log_prob(
-                rows["action"]
-            )
-            for state in states
-        ]
+        given = [TensorDict({"observation": state}, [64]) for state in states]
+        cloning = [-actor.get_dist(each).log_prob(rows["action"]) for each in given]
         expected = policy_gradient(actor, torch.cat(cloning).mean())
         found = policy_gradient(actor, recovery(actor, fitted, rows))
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)

@@ -57,11 +57,8 @@ def seeing(name: str, encoder: nn.Module) -> Networks:
     return networks
 
 
-# These hand the state itself to a model of the dynamics, or perturb it themselves.
-SEEING = sorted(set(LOSSES) - {"latent-model", "sdc", "rorl"})
-
-
-@pytest.mark.parametrize("name", SEEING)
+# Those hand the state itself to a model of the dynamics, or perturb it themselves.
+@pytest.mark.parametrize("name", sorted({*LOSSES} - {"latent-model", "sdc", "rorl"}))
 def test_images_reach_convolutions_with_one_batch_dimension(name) -> None:
     encoder = nn.Sequential(nn.Conv2d(1, S, 2), nn.Flatten()).double()
     for size in ((6,), (2, 3)):
@@ -119,16 +116,13 @@ def test_critics_may_be_a_list_of_any_length_or_one_to_be_copied(name) -> None:
     assert not torch.equal(first[0], first[1])
 
 
-OTHER_CRITICS = [
-    lambda critic: critic.module.insert(1, nn.Dropout(0.1)),
-    lambda critic: critic.module.__setitem__(1, nn.Sigmoid()),
-    lambda critic: critic.requires_grad_(False),
-]
-
-
 @with_critics
 def test_a_list_of_unlike_critics_is_refused(name) -> None:
-    for change in OTHER_CRITICS:
+    for change in (
+        lambda critic: critic.module.insert(1, nn.Dropout(0.1)),
+        lambda critic: critic.module.__setitem__(1, nn.Sigmoid()),
+        lambda critic: critic.requires_grad_(False),
+    ):
         networks = make_networks(name, number=3)
         change(critics_of(name, networks)[1])
         with pytest.raises(ValueError, match="qvalue_network differ"):
@@ -168,29 +162,24 @@ def test_a_misspelt_choice_is_refused(name, option) -> None:
         make_loss(name, **{option: "l2"})
 
 
-def test_recurrent_actors_are_refused() -> None:
+def test_recurrent_actors_and_actors_of_other_bounds_are_refused() -> None:
     gru = GRUModule(S, 8, in_key="observation", out_key="hidden")
     layer = TensorDictModule(nn.Linear(8, 2), ["hidden"], ["action"])
     with pytest.raises(ValueError, match="actor_network is recurrent"):
         StateRecoveryLoss(TensorDictSequential(gru, layer), recovery_target="data")
-
-
-def test_a_tanh_module_has_bounds_too() -> None:
     layer = TensorDictModule(nn.Linear(S, 2), ["observation"], ["action"])
     tanh = TanhModule(in_keys=["action"], low=-2.0, high=2.0)
     actor, model = TensorDictSequential(layer, tanh), Networks().model
     with pytest.raises(ValueError, match="share their action bounds"):
         StateRecoveryLoss(actor, model)
+    for name in ("td3-bc", "rebrac"):
+        with pytest.raises(ValueError, match="pass low= and high="):
+            make_loss(name, low=None)
 
 
-FROZEN = {
-    "osr": ("model", "recovery_kl"),
-    "osr-v": ("model", "recovery_gap"),
-    "discrete": ("choice_model", "recovery_kl"),
-    "recovery": ("model", "recovery_kl"),
-    "official": ("model", "recovery_kl"),
-    "sdc": ("dynamics", "deviation"),
-}
+FROZEN = dict.fromkeys(["osr", "recovery", "official"], ("model", "recovery_kl"))
+FROZEN |= {"osr-v": ("model", "recovery_gap"), "sdc": ("dynamics", "deviation")}
+FROZEN["discrete"] = "choice_model", "recovery_kl"
 
 
 @pytest.mark.parametrize("name", FROZEN)
@@ -240,9 +229,3 @@ def test_a_loss_is_where_its_networks_are(monkeypatch) -> None:
     numbers = [*loss.parameters(), *loss.buffers(recurse=False)]
     assert len(numbers) > 5
     assert all(each.is_meta for each in numbers)
-
-
-def test_td3_needs_the_bounds_of_a_plain_actor() -> None:
-    for name in ("td3-bc", "rebrac"):
-        with pytest.raises(ValueError, match="pass low= and high="):
-            make_loss(name, low=None)

@@ -6,11 +6,9 @@ import copy
 
 import pytest
 import torch
-from objectives.losses import Networks, density, make_batch, update_targets
+from objectives.losses import Networks, density, make_batch, make_loss
 from objectives.plain import BOX, SOFT, Plain, compare, following, prepare
 from torch import Tensor
-
-from torchrl_osr import OSRVLoss
 
 WEIGHT, TEMPERATURE = 2.5, 1.7
 
@@ -85,14 +83,10 @@ def restated(networks: Networks, batch, number: int, values: str, target: str):
 @pytest.mark.parametrize("target", ["inverse_dynamics", "data"])
 @pytest.mark.parametrize("values", ["mean", "cql"])
 @pytest.mark.parametrize("number", [1, 3])
-def test_losses_and_gradients_equal_the_restatement(
-    check, values, target, number
-) -> None:
+def test_losses_and_gradients_equal_the_restatement(check, values, target, number):
     networks, batch = Networks(**BOX), make_batch("osr-v", 10)
     options = {"policy_values": values, "recovery_target": target, "num_random": number}
     expected = restated(networks, batch, number, values, target)
     options |= SOFT | {"recovery_weight": WEIGHT, "temperature": TEMPERATURE}
-    loss = OSRVLoss(networks.actor, networks.critics, networks.model, **options)
-    loss = update_targets(loss.double())
-    label = "OSR-v" + " on the data's actions" * (target == "data")
-    compare(check, label, prepare(loss), batch, *expected)
+    loss = prepare(make_loss("osr-v", networks, **options))
+    compare(check, "OSR-v", loss, batch, *expected)

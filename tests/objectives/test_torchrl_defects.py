@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 import torchrl.objectives
-from objectives.losses import Networks, make_batch, update_targets
+from objectives.losses import BOX, Networks, make_batch, update_targets
 from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import CQLLoss, SACLoss
 from torchrl.objectives import TD3BCLoss as TorchRLsTD3BC
@@ -27,9 +27,8 @@ def make_loss(loss_class: type, networks: Networks, **options):
     if loss_class is CQLLoss:
         options = {"loss_function": "l2"} | options
     options = {"target_entropy": -2.0} | options
-    loss = loss_class(networks.actor, networks.critics, **options).double()
-    update_targets(loss)
-    return loss
+    loss = loss_class(networks.actor, networks.critics, **options)
+    return update_targets(loss.double())
 
 
 def penalties(weight: float) -> dict[str, float]:
@@ -66,11 +65,8 @@ def test_cql_loss_of_torchrl_sums_three_actions_and_scores_some_elsewhere() -> N
 # multiplier's loss is not detached from the critics, and with one backward over the sum
 # of the losses, as in its own example, it raises the gap.
 def test_cql_loss_of_torchrl_lets_the_multiplier_train_the_critics() -> None:
-    gradients = {}
-    for loss_class, option in (
-        (OurCQL, {"target_action_gap": 10.0}),
-        (CQLLoss, {"with_lagrange": True}),
-    ):
+    gradients, ours, theirs = {}, {"target_action_gap": 10.0}, {"with_lagrange": True}
+    for loss_class, option in ((OurCQL, ours), (CQLLoss, theirs)):
         loss = make_loss(loss_class, Networks(), min_q_weight=1.0, **option)
         out = loss(make_batch("cql", 64))
         critics = list(loss.qvalue_network_params.parameters())
@@ -103,11 +99,8 @@ def test_cloning_term_of_torchrl_ignores_masks() -> None:
     batch["collector", "mask"] = (torch.arange(10) < 5).unsqueeze(-1)
     spoiled = batch.clone()
     spoiled["action"][5:] = 0.99
-    same = {}
-    for loss_class, bounds in (
-        (TD3BCLoss, {"low": -1.0, "high": 1.0}),
-        (TorchRLsTD3BC, {"bounds": (-1.0, 1.0)}),
-    ):
+    same, theirs = {}, {"bounds": (-1.0, 1.0)}
+    for loss_class, bounds in ((TD3BCLoss, BOX), (TorchRLsTD3BC, theirs)):
         networks = Networks()
         networks.actor = torchrl.modules.Actor(networks.module.module)
         loss = loss_class(networks.actor, networks.critics, **bounds).double()

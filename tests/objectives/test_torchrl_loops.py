@@ -6,8 +6,6 @@ name would be lost without an error.
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from objectives.losses import assert_same_bits
@@ -33,7 +31,7 @@ pytestmark = [
 ]
 
 
-def make_loss(loss_class: type = OSRLoss, **options: Any):
+def make_loss(loss_class: type, **options):
     """Return a loss for Pendulum; equal weights at each call."""
     torch.manual_seed(0)
     return loss_class(
@@ -48,26 +46,17 @@ def make_trainer(loss, optimizer) -> CQLTrainer:
     environment = GymEnv("Pendulum-v1")
     environment.set_seed(0)
     collector = Collector(
-        environment,
-        loss.actor_network,
-        frames_per_batch=32,
-        total_frames=64,
+        environment, loss.actor_network, frames_per_batch=32, total_frames=64,
         auto_register_policy_transforms=True,
-    )
+    )  # fmt: skip
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=16)
     buffer.append_transform(StatePerturbation(std=0.1))
     return CQLTrainer(
-        collector=collector,
-        total_frames=64,
-        frame_skip=1,
-        optim_steps_per_batch=3,
-        loss_module=loss,
-        optimizer=optimizer,
-        replay_buffer=buffer,
-        target_net_updater=SoftUpdate(loss, tau=0.1),
-        progress_bar=False,
+        collector=collector, total_frames=64, frame_skip=1, optim_steps_per_batch=3,
+        loss_module=loss, optimizer=optimizer, replay_buffer=buffer,
+        target_net_updater=SoftUpdate(loss, tau=0.1), progress_bar=False,
         enable_logging=False,
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", LOSSES)

@@ -48,34 +48,30 @@ def make(transitions):
     Two of them are the same run up to their folders.
     """
 
-    def make(folder, *, targets=True, **options) -> OfflineTrainer:
+    def make(folder, **options) -> OfflineTrainer:
         loss = make_loss("osr").float()
         perturbation = StatePerturbation(0.1, seed=0)
-        updater = SoftUpdate(loss, tau=0.1)
         tracing = {name: options.pop(name, False) for name in ("trace", "warm_up")}
         scores = iter(range(1000))
         evaluate = options.pop("evaluate", lambda: {"score": next(scores), "raw": [1]})
         interval, best = options.pop("eval_interval", 5), options.pop("best", "max")
         options = {
-            "total_steps": 20,
-            "components": {"perturbation": perturbation},
+            "total_steps": 20, "components": {"perturbation": perturbation},
             "evaluation": Evaluation(evaluate, interval, best=best),
-            "checkpoint_interval": 5,
-            "log_interval": 3,
-            "progress": False,
-        } | options
+            "checkpoint_interval": 5, "log_interval": 3, "progress": False,
+        } | options  # fmt: skip
         buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
         buffer.append_transform(perturbation)
         optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
-        update = FastUpdate(loss, optimizer, updater if targets else None, **tracing)
+        update = FastUpdate(loss, optimizer, SoftUpdate(loss, tau=0.1), **tracing)
         return OfflineTrainer(update, buffer, folder=folder, **options)
 
     return make
 
 
 @pytest.fixture
-def undisturbed(make, tmp_path) -> OfflineTrainer:
-    """A whole run."""
+def whole(make, tmp_path) -> OfflineTrainer:
+    """A run that nothing disturbs."""
     trainer = make(tmp_path / "undisturbed")
     trainer.train()
     return trainer

@@ -41,9 +41,7 @@ def files(trainer) -> set[str]:
 
 
 @pytest.mark.parametrize("steps", [[1], [5], [19], [2, 3, 9], [7, 8]])
-def test_interrupted_run_ends_as_an_undisturbed_one(
-    tmp_path, make, state, logger, undisturbed, steps
-):
+def test_interrupted_run_ends_alike(tmp_path, make, state, logger, whole, steps):
     for step in steps:
         trainer = make(tmp_path / "run", loggers=[logger])
         stop_in(trainer, step)
@@ -55,9 +53,9 @@ def test_interrupted_run_ends_as_an_undisturbed_one(
         assert files(trainer) == names
     resumed = make(tmp_path / "run", loggers=[logger])
     resumed.train()
-    assert_same_bits(state(resumed), state(undisturbed))
+    assert_same_bits(state(resumed), state(whole))
     assert [row["step"] for row in resumed.history] == [0, 5, 10, 15, STEPS]
-    assert files(resumed) == files(undisturbed)
+    assert files(resumed) == files(whole)
     logged = [step for name, step, _ in logger.numbers if name == "train/loss_qvalue"]
     assert logged == [3, 5, 6, 9, 10, 12, 15, 18, 20]
 

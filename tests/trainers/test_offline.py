@@ -52,12 +52,12 @@ def manifest_of(path: Path) -> dict:
         return json.loads(archive.read("manifest.json"))
 
 
-def test_updates_evaluations_and_checkpoints_come_when_due(make, undisturbed):
-    assert undisturbed.step == undisturbed.collected_frames == STEPS
-    steps = {int(row["step"]) for row in undisturbed.optimizer.state.values()}
+def test_updates_evaluations_and_checkpoints_come_when_due(make, whole):
+    assert whole.step == whole.collected_frames == STEPS
+    steps = {int(row["step"]) for row in whole.optimizer.state.values()}
     assert steps == {STEPS}
-    assert steps_of(undisturbed) == [0, 5, 10, 15, 20]
-    checkpoints = undisturbed.checkpoints
+    assert steps_of(whole) == [0, 5, 10, 15, 20]
+    checkpoints = whole.checkpoints
     names = [f"checkpoint-0000000000{step}.torchrl" for step in (15, 20)]
     there = sorted(path.name for path in checkpoints.folder.iterdir())
     assert there == ["best.torchrl", *names]
@@ -68,7 +68,7 @@ def test_updates_evaluations_and_checkpoints_come_when_due(make, undisturbed):
     }  # fmt: skip
     again = make(checkpoints.folder, evaluate=pytest.fail)
     again.train()  # returns at once
-    assert again.history == undisturbed.history
+    assert again.history == whole.history
 
 
 # -- resume ---------------------------------------------------------------------------
@@ -76,16 +76,14 @@ def test_updates_evaluations_and_checkpoints_come_when_due(make, undisturbed):
 
 @pytest.mark.parametrize("kills", [[3], [12, 3], [5, 5, 9]])
 @pytest.mark.parametrize("trace", [False, True])
-def test_killed_and_resumed_run_ends_with_the_same_bits(
-    tmp_path, make, state, undisturbed, kills, trace
-):
-    wanted, step = state(undisturbed), 0
+def test_killed_run_ends_in_the_same_bits(tmp_path, make, state, whole, kills, trace):
+    wanted, step = state(whole), 0
     for more in kills:
         stop_at(make(tmp_path / "run"), step := step + more)
     resumed = make(tmp_path / "run", trace=trace, warm_up=1)
     resumed.train()
     assert_same_bits(state(resumed), wanted)
-    assert steps_of(resumed) == steps_of(undisturbed)
+    assert steps_of(resumed) == steps_of(whole)
 
 
 def assert_resumes(make_run, state, tmp_path) -> OfflineTrainer:
@@ -99,29 +97,17 @@ def assert_resumes(make_run, state, tmp_path) -> OfflineTrainer:
     return whole
 
 
-def torchrls_loss():
-    networks = Networks()
-    return update_targets(
-        SACLoss(networks.actor, networks.critics, target_entropy=-2.0).float()
-    )
+MADE = {
+    "TorchRL's": lambda of: SACLoss(of.actor, of.critics, target_entropy=-2.0),
+    "metrics of rows": lambda of: TD3BCLoss(of.delta, of.critics, bounds=(-1.0, 1.0)),
+    "ours": lambda of: make_loss("model", of, states="clean"),
+}
 
 
-def metrics_of_rows():
-    networks = Networks()
-    loss = TD3BCLoss(networks.delta, networks.critics, bounds=(-1.0, 1.0))
-    return update_targets(loss.float())
-
-
-def torchrl_osrs_loss():
-    return make_loss("model", states="clean").float()
-
-
-@pytest.mark.parametrize("made", [torchrls_loss, metrics_of_rows, torchrl_osrs_loss])
-def test_a_sampler_without_replacement_goes_on_in_its_epoch(
-    tmp_path, state, transitions, made
-):
+@pytest.mark.parametrize("made", MADE)
+def test_sampler_without_replacement_ends_its_epoch(tmp_path, state, transitions, made):
     def make_run(folder):
-        loss = made()
+        loss = update_targets(MADE[made](Networks()).float())
         buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
         buffer.set_sampler(SamplerWithoutReplacement())
         adam, (first, *_) = torch.optim.Adam(loss.parameters()), loss.parameters()
@@ -134,9 +120,7 @@ def test_a_sampler_without_replacement_goes_on_in_its_epoch(
 
 
 @pytest.mark.parametrize("trace", [False, True])
-def test_priorities_follow_the_errors_and_are_restored(
-    tmp_path, state, transitions, trace
-):
+def test_priorities_follow_errors_and_are_restored(tmp_path, state, transitions, trace):
     def make_run(folder, name="osr"):
         loss = make_loss(name).float()
         buffer = TensorDictReplayBuffer(
@@ -167,9 +151,7 @@ def test_priorities_follow_the_errors_and_are_restored(
 
 
 @pytest.mark.parametrize("step", [7, 20])
-def test_longer_run_equals_one_that_was_so_from_the_start(
-    tmp_path, make, state, undisturbed, step
-):
+def test_longer_run_equals_one_that_was_so_from_the_start(tmp_path, make, whole, step):
     """Killed before, or finished; other intervals change no update."""
     short = {"total_steps": 10, "eval_interval": 2, "checkpoint_interval": 3}
     if step < 10:
@@ -178,7 +160,7 @@ def test_longer_run_equals_one_that_was_so_from_the_start(
         make(tmp_path, **short).train()
     longer = make(tmp_path)
     longer.train()
-    networks = longer.loss_module.state_dict(), undisturbed.loss_module.state_dict()
+    networks = longer.loss_module.state_dict(), whole.loss_module.state_dict()
     assert_same_bits(*(each.values() for each in networks))
     assert longer.history[-1]["step"] == STEPS
     with pytest.raises(ValueError, match="is at step 20, beyond the 19 steps"):
@@ -206,9 +188,7 @@ def test_best_checkpoint_is_of_the_best_evaluation(tmp_path, make, best, scores,
     assert set(manifest["components"]) == {"loss_module", "perturbation"}
 
 
-def test_an_evaluation_that_kills_the_process_loses_no_step(
-    tmp_path, make, state, undisturbed
-):
+def test_evaluation_that_kills_the_process_loses_no_step(tmp_path, make, state, whole):
     def evaluate():
         if trainer.step == 10:
             raise KeyboardInterrupt
@@ -220,11 +200,11 @@ def test_an_evaluation_that_kills_the_process_loses_no_step(
     assert trainer.checkpoints.latest().name == "checkpoint-000000000010.torchrl"
     trainer = make(tmp_path, evaluate=lambda: {"score": trainer.step / 5, "raw": [1]})
     trainer.train()
-    assert trainer.history == undisturbed.history
-    assert_same_bits(state(trainer), state(undisturbed))
+    assert trainer.history == whole.history
+    assert_same_bits(state(trainer), state(whole))
 
 
-def test_a_failing_evaluation_costs_itself_alone(tmp_path, make, state, undisturbed):
+def test_a_failing_evaluation_costs_itself_alone(tmp_path, make, whole):
     def evaluate():
         if trainer.step == 10:
             raise RuntimeError("motor driver lost connection")
@@ -234,7 +214,7 @@ def test_a_failing_evaluation_costs_itself_alone(tmp_path, make, state, undistur
     trainer.train()
     assert list(trainer.failed_evaluations) == [10]
     assert steps_of(trainer) == [0, 5, 15, 20]
-    networks = (each.loss_module.state_dict() for each in (trainer, undisturbed))
+    networks = (each.loss_module.state_dict() for each in (trainer, whole))
     assert_same_bits(*(each.values() for each in networks))
 
 
@@ -253,10 +233,8 @@ def truncate(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [corrupt, truncate])
-def test_damaged_newest_checkpoint_falls_back_to_the_one_before(
-    make, state, undisturbed, damage, caplog
-):
-    wanted, folder = state(undisturbed), undisturbed.checkpoints.folder
+def test_a_damaged_newest_checkpoint_is_passed_over(make, state, whole, damage, caplog):
+    wanted, folder = state(whole), whole.checkpoints.folder
     damage(folder / "checkpoint-000000000020.torchrl")
     resumed = make(folder)
     assert resumed.resume().name == "checkpoint-000000000015.torchrl"
