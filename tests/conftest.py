@@ -7,11 +7,19 @@ import signal
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from tensordict import TensorDict
 
 pytest_plugins = ["processes"]
 
 torch.set_num_threads(1)
+
+# The same examples everywhere, and no folder of them.
+every = list(HealthCheck)
+settings.register_profile(
+    "alike", deadline=None, database=None, derandomize=True, suppress_health_check=every
+)
+settings.load_profile("alike")
 
 # What ignores them, such as nohup or a shell's "&", would be inherited by the runs that
 # tests send signals to.

@@ -8,7 +8,9 @@ from objectives.losses import Networks, assert_same_bits, call, make_batch, make
 from torch._dynamo.testing import CompileCounter
 from torchrl.objectives import HardUpdate, SoftUpdate
 
+from torchrl_osr import CQLLoss
 from torchrl_osr.fast import FastUpdate, NonfiniteError, fuse_critics
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 
 STEPS = 7
 
@@ -71,6 +73,29 @@ def test_a_delay_needs_something_to_delay_and_something_to_train(params) -> None
     params = list(loss.parameters()) if params else params
     with pytest.raises(ValueError, match="policy_delay=2 needs policy_params"):
         FastUpdate(loss, adam(loss.parameters()), policy_delay=2, policy_params=params)
+
+
+def test_a_parameter_may_be_frozen_between_delayed_updates() -> None:
+    loss = make_loss("osr").float()
+    delayed = [*loss.actor_network_params.parameters()]
+    options = {"policy_delay": 2, "policy_params": delayed}
+    update = FastUpdate(loss, adam(loss.parameters()), soft(loss), **options)
+    frozen = next(loss.qvalue_network_params.parameters()).requires_grad_(False)
+    before = frozen.clone()
+    for _ in range(2):
+        update(make_batch("osr", 5).float())
+    assert torch.equal(frozen, before)
+
+
+def test_bounds_that_are_numbers_stay_as_they_are() -> None:
+    actor, critics = (
+        tanh_gaussian_actor(3, 2, low=-0.4, high=0.7),
+        critic_ensemble(3, 2),
+    )
+    loss = CQLLoss(actor.double(), [each.double() for each in critics])
+    FastUpdate(loss, adam(loss.parameters()))
+    head = loss.actor_network[-1].distribution_kwargs
+    assert (head["low"], head["high"]) == (-0.4, 0.7)
 
 
 def test_the_losses_alone_are_computed_in_half_precision() -> None:

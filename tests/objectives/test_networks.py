@@ -15,6 +15,7 @@ from objectives.losses import (
     Networks,
     S,
     assert_same,
+    assert_same_bits,
     call,
     make_batch,
     make_loss,
@@ -204,12 +205,13 @@ def test_a_frozen_network_has_the_weights_that_a_loss_loads() -> None:
     loss, other = make_loss("osr"), make_loss("osr", make_networks("osr", seed=9))
     loss.load_state_dict(other.state_dict())
     assert not loss.inverse_dynamics_network.training, "labels would be random"
-    held = loss.inverse_dynamics_network.parameters()
-    assert all(map(torch.equal, held, other.inverse_dynamics_network.parameters()))
+    held = [*loss.inverse_dynamics_network.parameters()]
+    assert held
+    assert_same_bits(held, [*other.inverse_dynamics_network.parameters()])
     model = make_networks("osr", seed=4).model
     loss.from_stateful_net("inverse_dynamics_network", model)
-    held = loss.inverse_dynamics_network.parameters()
-    assert all(map(torch.equal, held, model.parameters()))
+    held = [*loss.inverse_dynamics_network.parameters()]
+    assert_same_bits(held, [*model.parameters()])
 
 
 def test_a_policy_that_is_first_asked_without_gradient_has_one() -> None:

@@ -55,6 +55,8 @@ def test_a_dictionary_is_joined_in_alphabetical_order(make_policy):
     policy.record["source"] = {"data": {"observation_names": [*"vaw"]}}
     named = dict(zip("vaw", rows.T[..., None], strict=True))  # a log's columns
     assert policy.act(named) == pytest.approx(policy.act(rows))
+    one = dict(zip("vaw", torch.tensor(rows[0]), strict=True))  # numbers
+    assert policy.act(one).numpy() == pytest.approx(policy.act(rows[0]), abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -82,7 +84,7 @@ def test_results_have_the_kind_of_the_observation(make_policy, kind):
     assert np.array_equal(out["action"].numpy(), many)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     observation=arrays(np.float32, (4, 1), elements=st.floats(-1e6, 1e6, width=32)),
     low=st.floats(-1e6, 1e6, width=32),

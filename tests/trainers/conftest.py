@@ -41,7 +41,7 @@ def state() -> Callable[[OfflineTrainer], list[torch.Tensor]]:
     return state_of_run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make(transitions):
     """Return a factory of trainers of 20 steps, which score 0, 1, 2 and so on.
 
@@ -69,10 +69,10 @@ def make(transitions):
     return make
 
 
-@pytest.fixture
-def whole(make, tmp_path) -> OfflineTrainer:
+@pytest.fixture(scope="session")
+def whole(make, tmp_path_factory) -> OfflineTrainer:
     """A run that nothing disturbs."""
-    trainer = make(tmp_path / "undisturbed")
+    trainer = make(tmp_path_factory.mktemp("whole") / "undisturbed")
     trainer.train()
     return trainer
 

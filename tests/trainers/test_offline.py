@@ -233,8 +233,11 @@ def truncate(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [corrupt, truncate])
-def test_a_damaged_newest_checkpoint_is_passed_over(make, state, whole, damage, caplog):
-    wanted, folder = state(whole), whole.checkpoints.folder
+def test_a_damaged_newest_checkpoint_is_passed_over(
+    tmp_path, make, state, whole, damage, caplog
+):
+    wanted = state(whole)
+    folder = shutil.copytree(whole.checkpoints.folder, tmp_path / "run")
     damage(folder / "checkpoint-000000000020.torchrl")
     resumed = make(folder)
     assert resumed.resume().name == "checkpoint-000000000015.torchrl"

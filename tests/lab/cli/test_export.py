@@ -16,7 +16,7 @@ def test_from_a_run_to_each_kind_of_file(tmp_path, run):
     make_run(tmp_path / "run")
     for arguments in [
         ("run", "p.safetensors"),
-        ("p.safetensors", "p.pt2"),
+        ("p.safetensors", "{p}.pt2"),
         ("run/checkpoint/policy/best.torchrl", "new/v.pt2", "--output", "value"),
     ]:
         output = run(tmp_path, "export", *arguments)

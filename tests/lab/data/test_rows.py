@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from property_settings import tried
 from tensordict import TensorDict
 
 from torchrl_osr.lab.data.rows import (
@@ -41,7 +40,6 @@ def episodes(lengths) -> TensorDict:
     return torch.cat(rows)
 
 
-@tried(100)
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
     sets, options = episodes([rows, 100]), {"random_share": share, "seed": seed}
@@ -74,7 +72,7 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
     check_order(data[4:])
 
 
-@tried(30)
+@settings(max_examples=30)
 @given(LENGTHS, st.integers(1, 8))
 def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
     data = episodes(lengths)

@@ -75,6 +75,7 @@ def test_a_mixture_has_exact_shares():
     for name in ("mean_return", "normalized_score"):
         expected = 0.1 * about[name] + 0.9 * other[name]
         assert manifest[name] == pytest.approx(expected)
+    assert manifest["checksum"] == about["checksum"] + other["checksum"]
 
 
 def d4rl_columns(data):

@@ -7,7 +7,7 @@ import copy
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lab.envs.recorder import Recorder, play
 
@@ -30,7 +30,6 @@ def executed(env, actions):
     return [float(action[0]) for action in env.unwrapped.actions]
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), max_size=12), st.integers(0, 9))
 def test_delay_shifts_the_actions(sent, steps):
     env = ActionDelay(Recorder(), steps)

@@ -106,7 +106,7 @@ def test_counted_modes_replace_the_agents_actions(mode):
 
 
 @given(st.integers(1, 30), st.integers(1, 20), st.integers(0, 2**40), MODES)
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_moments_lie_in_the_window_and_follow_seeds(start, width, seed, mode):
     window = (start, start + width)
     env = ActionKnock(Recorder(), 2, mode=mode, at=window)

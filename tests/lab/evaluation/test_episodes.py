@@ -6,10 +6,18 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs import ObservationNorm
 
 from torchrl_osr.lab.data import reference_returns
-from torchrl_osr.lab.evaluation import EpisodeEvaluator, measure_of, summarize
+from torchrl_osr.lab.evaluation import (
+    EpisodeEvaluator,
+    deterministic_policy,
+    measure_of,
+    summarize,
+)
 from torchrl_osr.lab.evaluation.episodes import EpisodeResults
+from torchrl_osr.modules import tanh_gaussian_actor
 
 
 def linear_policy(observation: torch.Tensor) -> torch.Tensor:
@@ -38,6 +46,15 @@ def test_each_episode_is_what_it_would_be_alone():
     assert len(set(results.lengths)) > 1, "episodes shall end at different times here"
     again = evaluator(linear_policy)
     np.testing.assert_array_equal(results.returns, again.returns)
+
+
+@pytest.mark.parametrize("standard_normal", [True, False])
+def test_a_policy_sees_what_the_transform_makes(standard_normal):
+    norm = ObservationNorm(1.0, 4.0, ["observation"], standard_normal=standard_normal)
+    actor, state = tanh_gaussian_actor(3, 2), torch.randn(4, 3)
+    seen = norm(TensorDict({"observation": state}, [4]))["observation"]
+    wanted = deterministic_policy(actor)(seen)
+    assert torch.equal(deterministic_policy(actor, norm)(state), wanted)
 
 
 def test_summary_has_scores_only_with_references():

@@ -60,6 +60,11 @@ def test_wrong_values_of_a_foreign_run_are_named(tmp_path, key, value, reason):
         read_run(tmp_path)
 
 
+def test_a_download_is_allowed_for_one_start(tmp_path):
+    write_config(tmp_path, checked(composed("train", "data.download=true")))
+    assert read_run(tmp_path).data.download is False
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [

@@ -184,7 +184,11 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
     wanted = torch.stack(wanted, 1)
     torch.testing.assert_close(switching.returns(state), wanted)
     actions = torch.stack([policy(state) for policy in policies], 1)
-    assert torch.equal(switching(state), actions[torch.arange(6), wanted.argmax(1)])
+    chosen = actions[torch.arange(6), wanted.argmax(1)]
+    assert torch.equal(switching(state), chosen)
+    switching.reset()
+    torch.testing.assert_close(switching(state.double()), chosen)
+    assert load_switching_policy(folders, gamma=0.5).gamma == 0.5
     alone = load_switching_policy(folders, critics_only=True)
     for column, policy in zip(alone.returns(state).T, policies, strict=True):
         values = [each.smallest_value(state, policy(state)) for each in policies]
