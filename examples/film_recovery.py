@@ -80,6 +80,8 @@ def main(arguments=None):
     trained = load_trained(given.run)
     task, norm = trained.config.env, trained.observation_norm
     check_environment(task.id)  # a run of others may name a module of theirs
+    if trained.inverse_dynamics is None:
+        parser.error(f"{given.run} has no inverse dynamics model: give a run of OSR.")
     expert = load_behavior_policy(task.name, "expert").deterministic
 
     def state_of(observation):

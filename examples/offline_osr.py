@@ -44,6 +44,7 @@ from torchrl_osr.lab.run.train import (
     prepare_machine,
     report,
     save_policies,
+    saved,
     trainer_options,
 )
 from torchrl_osr.modules import (
@@ -100,7 +101,7 @@ def train(run: Run) -> float:
 
     # All trainers share these. A killed run continues from its last checkpoint.
     shared = trainer_options(run)
-    kept = {"perturbation": perturbation, "observation_norm": data.norm}
+    kept = {"perturbation": perturbation, "observation_norm": saved(data.norm)}
 
     # 3. The inverse dynamics model, by maximum likelihood on D_tot.
     model_loss = InverseDynamicsLoss(model, **options_in(config.inverse_dynamics.loss))
@@ -174,8 +175,12 @@ def check_scope(config: TrainConfig) -> None:
         or config.recovery is not None
         or config.dynamics.use
         or config.trainer.compile
+        or config.env.discrete
     ):
-        raise ValueError("this page trains loss=osr or osr_v: use torchrl-osr train.")
+        raise ValueError(
+            "this page trains loss=osr or osr_v with default networks and continuous "
+            "actions, without recovery, dynamics or compile: use torchrl-osr train."
+        )
 
 
 if __name__ == "__main__":

@@ -145,8 +145,10 @@ def main(arguments: Sequence[str]) -> None:
     torch.set_num_threads(1)
     run = load_trained(options.run, trust=options.trust)
     check_environment(run.config.env.id, options.trust)
-    if not isinstance(run.loss, OSRLoss):
-        parser.error(f"{options.run} is no run of loss=osr or loss=osr_10.")
+    if not isinstance(run.loss, OSRLoss) or run.config.env.id is None:
+        parser.error(
+            f"{options.run} is no run of loss=osr or loss=osr_10 with a simulator."
+        )
     if options.min_q_weight is not None:
         run.loss.min_q_weight = options.min_q_weight
     options.output.mkdir(parents=True, exist_ok=True)

@@ -47,6 +47,20 @@ def test_readme_has_one_command_to_train_and_one_to_test():
         assert re.search(rf"(?m)^python3 -m venv .* && {command}$", text)
 
 
+def test_named_versions_are_those_of_the_constraints():
+    """A new TorchRL lists the places that name the old one."""
+    pins = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pins = {"0.11", *re.findall(r"(?m)^(?:torchrl|tensordict)==(\S+)", pins)}
+    for file in [
+        *PAGES,
+        *ROOT.glob("torchrl_osr/**/*.py"),
+        *ROOT.glob("tests/**/*.py"),
+    ]:
+        text = file.read_text(encoding="utf-8")
+        named = re.findall(r"(?:TorchRL|tensordict) (\d+(?:\.\d+)+)", text)
+        assert {*named} <= pins, file
+
+
 def test_readmes_diff_is_of_the_drop_in_example():
     (block,) = grab_code_blocks(README.read_text(encoding="utf-8"), lang="diff")
     example = (ROOT / "examples" / "drop_in_loss.py").read_text(encoding="utf-8")

@@ -38,5 +38,5 @@ def needed_by(what: str, extra: str) -> Iterator[None]:
         yield
     except ImportError as error:
         raise ImportError(
-            f"{what} {error.name!r}: pip install torchrl-osr[{extra}]"
+            f"{what} {error.name!r}: pip install 'torchrl-osr[{extra}]'"
         ) from error

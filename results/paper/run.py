@@ -8,9 +8,8 @@
     python results/paper/run.py table1 --pack                # and then page.py
 
 Each run is one process with one torch thread. Stop the script at any time and start it
-again: finished runs are skipped, others resume. Runs that are in the tables of this
-folder with as many updates are not made again. ``--pack`` adds finished runs to these
-tables.
+again: finished runs are skipped, others resume. ``--missing`` leaves out runs that are
+in the tables of this folder with as many updates, ``--pack`` adds finished ones.
 """
 
 from __future__ import annotations
@@ -245,6 +244,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
+    parser.add_argument("--missing", action="store_true", help="only those not packed")
     options = parser.parse_args()
     table = TABLES[options.table]
     top, tables = options.folder / table.place, RESULTS / table.place
@@ -255,7 +255,7 @@ def main() -> None:
         return
     if unknown := {*(options.data or ())} - {*names}:
         parser.error(f"--data has {sorted(unknown)}; expected some of {names}.")
-    done = packed(tables, table.suites)
+    done = packed(tables, table.suites) if options.missing else set()
     grid = product(
         options.seeds or table.seeds,
         [data for data in table.data if folder_name(data) in (options.data or names)],

@@ -142,3 +142,11 @@ def test_missing_entries_and_those_of_another_shape_are_named(name) -> None:
             loss(batch.exclude("perturbed"))
     with pytest.raises(ValueError, match="batch is empty .*at least one transition"):
         loss(make_batch(name, 4, 0))
+
+
+def test_an_error_about_a_state_lists_the_whole_batch() -> None:
+    batch = make_batch("cql", 4)
+    batch["obs"] = batch.pop("observation")
+    with pytest.raises(KeyError, match="no entry") as error:
+        call(make_loss("cql"), batch)
+    assert "'obs'" in error.value.args[0]

@@ -67,6 +67,6 @@ def test_what_cannot_be_exported(tmp_path, make_policy, monkeypatch):
     with pytest.raises(ValueError, match="output must be one of"):
         policy.export(tmp_path / "policy.onnx", "state")
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(ImportError, match=r"pip install torchrl-osr\[export\]"):
+    with pytest.raises(ImportError, match=r"pip install 'torchrl-osr\[export\]'"):
         policy.export(tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())

@@ -114,6 +114,8 @@ class Transitions:
         An entry without a perturbed one is the same in both halves.
         """
         rows = self.rows
+        for key in keys:
+            entry(self.tensordict, key)  # an error lists the whole batch
         clean = TensorDict({key: entry(rows, key) for key in keys}, rows.batch_size)
         if states == "clean":
             return clean.unsqueeze(0)

@@ -347,10 +347,17 @@ def joined(observation: Any, columns: Sequence[str] = ()) -> Any:
     """Return a dictionary's vectors as one, in the order of columns or alphabet."""
     if not isinstance(observation, Mapping):
         return observation
-    keys = columns if {*columns} == {*observation} else sorted(observation)
+    known = {*columns} == {*observation}
+    single = (x for x in observation.values() if not isinstance(x, Mapping))
+    if columns and not known and any(np.ndim(x) == 0 for x in single):
+        raise ValueError(
+            f"the observation has numbers named {[*observation]}, and the columns of "
+            f"the log are {[*columns]}: give these, or one vector in their order."
+        )
+    keys = columns if known else sorted(observation)
     parts = [joined(observation[key]) for key in keys]
     if all(isinstance(part, Tensor) for part in parts):
-        return torch.cat([torch.atleast_1d(part) for part in parts], -1)
+        return torch.cat([part if part.ndim else part[None] for part in parts], -1)
     return np.concatenate([np.atleast_1d(part) for part in parts], -1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from composed import composed
 from composed import trained as trained_on
 from gymnasium.envs.classic_control import PendulumEnv
@@ -21,6 +23,7 @@ from torchrl_osr.lab.report import read_runs, write_report
 from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run.config import read_run
 from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
+from torchrl_osr.lab.run.folder import read_status
 from torchrl_osr.lab.run.load import load_run_policy
 
 
@@ -97,17 +100,20 @@ def test_a_run_knows_its_data_by_their_contents(tmp_path):
         disturbed(run)
     disturbed(run, f"data.path={moved}")
     with np.load(moved) as columns:
-        np.savez(log, **{**columns, "reward": -columns["reward"]})
+        changed = {name: 2 * columns[name] for name in ("observation", "reward")}
+        np.savez(log, **{**columns, **changed})
     refused = r"data.path=.*log\.npz has other contents .* began with: give data.path="
     for play in partial(disturbed, run, "force=true"), partial(trained_on, run, *more):
         with pytest.raises(ValueError, match=refused):
             play()
+    assert read_status(run)["status"] == "done", "it is as it was"
     trained_on(run, more[0], f"data.path={moved}")
     assert read_run(run).data.path == str(moved)
     fixed = trained(tmp_path / "fixed", *given, f"data.path={log}")
     os.replace(log, moved)
     trained_on(run, *more, "force=true")
     assert read_run(run).data.checksum == read_run(fixed).data.checksum
+    assert torch.equal(load_run_policy(run).loc, load_run_policy(fixed).loc)
 
 
 def test_a_run_that_fails_before_its_training_is_none(tmp_path):
@@ -260,6 +266,13 @@ def test_bounds_and_discrete_actions_may_be_given(tmp_path, capsys, monkeypatch)
     run = trained(tmp_path / "whole", *given, "env.action_size=2")
     trained(run, *given, "env.action_size=2", "trainer.steps=20")
     assert load_run_policy(run).act(np.zeros(4)) in (0, 1)
+    with pytest.raises(ValueError, match="env.id is not given"):
+        record(tmp_path / "more.npz", f"policy={run}")
+    for option in ("data.path=/log.npz", "--frame-skip=0"):
+        monkeypatch.setattr("sys.argv", ["torchrl-osr", str(run), option])
+        with pytest.raises(SystemExit):
+            evaluate_offline.main()
+        assert re.search("no run; options|skip 0; expected", capsys.readouterr().err)
     monkeypatch.setattr("sys.argv", ["torchrl-osr", str(run), "--steps", "5"])
     evaluate_offline.main()
     assert "value " in capsys.readouterr().out

@@ -86,6 +86,8 @@ def test_the_saved_share_of_known_tables():
     assert all_of_them[:3] == pytest.approx((100, 34.2380, 100), abs=1e-4)
     none = recovered_share(np.zeros((3, 4)), walk)
     assert none[:3] == pytest.approx((0, 0, 65.7620), abs=1e-4)
+    one = recovered_share([[0.6]], [3])  # of five checkpoints
+    assert one[:3] == pytest.approx((60, *[100 * x for x in wilson(0.6, 1)]))
     # A walk with more states counts for more.
     assert recovered_share([[1, 1, 1, 0]], [0, 0, 0, 1]).mean == 75
 

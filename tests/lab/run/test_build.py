@@ -84,6 +84,8 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
         (["loss=rambo", "dynamics.real_ratio=1.0"], "set it to 0"),
         (["loss=mopo", "dynamics.real_ratio=0.001"], "real_ratio=0.001: 0 of"),
         (["loss=rim", "optim.gamma=1"], "needs optim.gamma below 1"),
+        (["loss=rim", "dynamics.num_elites=1"], "needs num_elites above 1"),
+        (["loss=td3_bc", "trainer.steps=1"], "policy_delay is above trainer.steps"),
         (["loss=rim", "dynamics.unknown=halts"], "dynamics.unknown must be one of"),
         (["loss=mopo", "dynamics.num_elites=9"], "num_elites=9 must be between 1"),
         (["env.id=CartPole-v1"], "discrete actions.*loss=discrete_osr"),

@@ -42,6 +42,8 @@ def test_keys_that_were_added_are_refused(key):
             "optim.actor_lr must be finite and at least 0, got -0.001",
         ),
         ("dynamics.penalty", -1.0, "dynamics.penalty must be finite and at least 0"),
+        ("data.reward_scale", 0.0, "data.reward_scale must not be 0"),
+        ("data.seed", -1, "data.seed must be at least 0, got -1"),
         ("optim.policy_delay", 0, "optim.policy_delay must be at least 1, got 0"),
         ("data.held_out", float("nan"), "data.held_out must be between 0 and 1"),
         ("optim.tau", 5.0, "optim.tau must be between 0 and 1, got 5"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import h5py
 import numpy as np
+import pytest
 import torch
 from composed import SMALL, configured
+from recorded_logs import make_columns
 
 from torchrl_osr.lab.run.data import TrainingData, load_data, load_training_data
 
@@ -56,6 +58,18 @@ def test_rewards_are_scaled_then_shifted():
     for name in ("next", "multi_step"):
         after[name, "reward"] = before[name, "reward"]
     assert (after == before).all(), "nothing else is touched"
+
+
+def test_a_log_of_ends_alone_teaches_no_recovery(tmp_path):
+    columns = make_columns(60)
+    columns |= {"terminated": np.ones(60), "action": columns["action"][:, :1]}
+    np.savez(log := tmp_path / "log.npz", **columns)
+    given = "env.id=Pendulum-v1", "data=file", f"data.path={log}"
+    small = [each for each in SMALL if not each.startswith("data=")]
+    config = configured(*small, *given)
+    with pytest.raises(ValueError, match="every row ends an episode.*loss=bc"):
+        load_training_data(config, in_keys=["observation", ("next", "done")])
+    load_training_data(config, in_keys=["observation"])
 
 
 def test_a_d4rl_file_has_the_bounds_of_its_run(tmp_path):

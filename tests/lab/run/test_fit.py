@@ -9,6 +9,7 @@ from composed import SMALL
 
 from torchrl_osr.lab import fit
 from torchrl_osr.lab.run.config import read_run
+from torchrl_osr.lab.run.folder import read_status
 
 
 def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
@@ -35,5 +36,6 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     assert read_run(folder).env.name == "log-my-arm"
     with pytest.raises(ValueError, match=r"my arm.npz has other contents than those"):
         fit(frame.assign(reward=0.5), folder, *small, *given)
+    assert read_status(folder)["status"] == "done", "it is as it was"
     again = fit(frame, folder, *small, *given)  # its columns are still there
     assert again.act(state) == policy.act(state)

@@ -12,6 +12,7 @@ import pytest
 from composed import composed, job
 from omegaconf import OmegaConf
 
+from torchrl_osr.lab.run.config import write_config
 from torchrl_osr.lab.run.folder import open_run, read_status
 from torchrl_osr.trainers import Interrupted
 
@@ -21,8 +22,8 @@ def opened(folder, *overrides):
 
 
 def claim(folder, *overrides) -> dict:
-    with opened(folder, *overrides):
-        pass
+    with opened(folder, *overrides) as run:
+        write_config(run.folder, run.config)  # as a training that has its data
     return written(folder)
 
 

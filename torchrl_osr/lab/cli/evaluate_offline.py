@@ -41,10 +41,12 @@ def main() -> None:
     add("--trust", action="append", default=[], help="module that the run may import")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
-    if options["steps"] is not None and options["steps"] < 1:
-        parser.error(f"--steps {options['steps']}; expected at least 1.")
+    for name in ("steps", "frame_skip"):
+        if options[name] is not None and options[name] < 1:
+            name, found = name.replace("_", "-"), options[name]
+            parser.error(f"--{name} {found}; expected at least 1.")
     for run in runs:
-        if "=" in run.name and not run.exists():
+        if "=" in str(run) and not run.exists():
             parser.error(f"{run} is no run; options have the form --data PATH.")
         run_folder_of(run)  # before time is spent
     if options.pop("checkpoints"):
@@ -66,6 +68,7 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
     rows = [("policy", "value", "[95 %]")]
     for run in order:
         interval = "[{value_low:.4g}, {value_high:.4g}]".format(**results[run])
+        interval = interval if results[run]["episodes"] > 1 else "one episode"
         rows.append((run, f"{results[run]['value']:.4g}", interval))
     rows.append(("the data, until its episodes end", f"{first['data_value']:.4g}", ""))
     lines = [

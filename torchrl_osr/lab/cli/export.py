@@ -74,7 +74,7 @@ def main() -> None:
     alarm = "with a monitor" if policy.data_monitor is not None else "without a monitor"
     print(
         f"{options.path}: {options.path.stat().st_size:,} bytes, {origin['loss']}, "
-        f"{origin['env_id']}, step {origin['step']}, {alarm}\n"
+        f"{origin['env_id'] or 'no simulator'}, step {origin['step']}, {alarm}\n"
         f"largest deviation on {ROWS} observations: {deviation:.1e}"
     )
 

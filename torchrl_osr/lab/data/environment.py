@@ -174,7 +174,8 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
         try:
             env = make()
         except gymnasium.error.NameNotFound as error:
-            what = f"Gymnasium has no {env_id!r} ({error}); gymnasium-robotics needs"
+            what = f"Gymnasium has no {env_id!r} ({error}). A task of your own is "
+            what += "env.id=<package>:<name>; a maze of gymnasium-robotics needs"
             # Importing it prints a note on hands to standard error.
             with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
                 import gymnasium_robotics

@@ -40,7 +40,8 @@ def read_minari(
     if here is None:
         raise FileNotFoundError(
             f"Minari set {str(path)!r} is not on this machine: fetch it with "
-            "data.download=true, or give its folder."
+            f"'torchrl-osr data data=minari data.path={path} data.download=true', or "
+            "give its folder."
         )
     # Without its spaces Minari makes the environment of the metadata to ask for them,
     # which can be any function of any package.

@@ -96,10 +96,12 @@ def _about_order(data: TensorDict) -> Iterator[str]:
     large = (change > JUMP * usual) & (change > SOME * before.std(0)) & (usual > 0)
     if jumps := large.any(1).nonzero()[:, 0].tolist():
         yield (
-            f"in {len(jumps):,} rows, such as {jumps[0]}, the state jumps by more than "
-            f"{JUMP} times its usual change: an angle may wrap, or a flag be missing."
+            f"in {len(jumps):,} rows, such as {jumps[0]} of the {len(data):,} to train "
+            f"on, the state jumps by more than {JUMP} times its usual change: an angle "
+            "may wrap, or a flag be missing."
         )
-    still = (change == 0).all(1).double().mean().item()
+    # A terminated row of a log may repeat its own state.
+    still = ((change == 0).all(1) & ~data["next", "terminated"][:, 0]).double().mean()
     if still > 0.5:
         yield (
             f"in {still:.0%} of the rows the state does not change: the sensors may be "

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from torchrl_osr._files import whole_file
+from torchrl_osr._files import check_writable, whole_file
 
 Act = Callable[[NDArray[Any]], ArrayLike]
 """Action in the environment's own units, ``[A]`` or a number, for a state ``[S]``."""
@@ -106,6 +106,7 @@ def check_log_path(path: Path) -> None:
     if path.exists():
         raise FileExistsError(f"path={path} exists: choose another.")
     path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path.parent)
 
 
 def write_log(path: Path, columns: Mapping[str, Any]) -> None:

@@ -105,6 +105,8 @@ def multi_step(data: TensorDictBase, *, n_steps: int, gamma: float) -> TensorDic
     steps, reward = torch.ones_like(last), single.clone()
     for step in range(1, n_steps):
         goes_on = followed[last]
+        if not goes_on.any():
+            break
         last = last + goes_on
         reward += goes_on.unsqueeze(-1) * gamma**step * single[last]
         steps += goes_on

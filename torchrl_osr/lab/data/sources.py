@@ -98,7 +98,7 @@ def load_dataset(
         useless = {"random_share": random_share, "num_transitions": num_transitions}
         _refuse(useless, f"data={source}, which is recorded")
         spec = None if env_id is None else environment_spec(env_id)
-        if path is None:
+        if not path:
             raise ValueError(f"data={source} needs data.path=...")
         data, manifest = _recorded(source, path, spec, num_actions, log, progress)
         if spec is not None:
@@ -110,10 +110,10 @@ def load_dataset(
                 "data=file data.path=<its place>."
             )
         _refuse(log, f"data={source}, which is rolled out")
-        if random_share and source == "random":
+        if random_share and (source == "random" or env_name in MAZE_IDS):
             raise ValueError(
                 f"data.random_share={random_share} mixes a source with random rows: "
-                "choose another source."
+                "choose another source, and no maze."
             )
         name = env_name if env_id is None else environment_name(env_id)
         if name not in known_ids() or name != env_name:

@@ -240,9 +240,10 @@ def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
         matching = exact or _in_order([n for n in names if fnmatchcase(n, pattern)])
         found += matching
         if not matching or (part not in VECTORS and len(found) > 1):
+            given, number = (patterns, len(found)) if matching else (pattern, 0)
             raise ValueError(
-                f"data.columns.{part}={pattern} names {len(matching)} columns; there "
-                f"are {', '.join(names)}."
+                f"data.columns.{part}={given} names {number} columns; there are "
+                f"{', '.join(names)}."
             )
     return found
 
@@ -271,7 +272,7 @@ def _in_order(names: list[str]) -> list[str]:
     if gaps := sorted({*range(1 if first else 0, last)} - numbered.keys()):
         raise ValueError(
             f"{numbered[first]} to {numbered[last]} lack number {gaps[0]}: if that is "
-            "right, list the columns to read (data.columns.observation=[...])."
+            "right, list the columns to read (data.columns.<part>=[...])."
         )
     return [numbered[number] for number in sorted(numbered)]
 

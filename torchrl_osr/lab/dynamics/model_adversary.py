@@ -60,7 +60,7 @@ class ModelAdversary:
         """Train the model; the buffer's generator draws rows, the number the rest."""
         options, device = self.options, self.model.elites.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(SEED + (self.data.seed << 20) + number)
+            torch.manual_seed((SEED + (self.data.seed << 20) + number) % 2**63)
             for step in range(options.adversarial_steps):
                 if step % options.rollout_steps == 0:
                     rows = self.real.sample(options.batch_size)

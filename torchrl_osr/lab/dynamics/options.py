@@ -93,6 +93,8 @@ class DynamicsOptions:
             why = f"real_ratio={self.real_ratio}: {real} of {batch_size} rows are real"
         elif rolled_out and self.unknown == "halt" and gamma == 1:
             why = "unknown=halt needs optim.gamma below 1"
+        elif rolled_out and self.unknown == "halt" and self.num_elites == 1:
+            why = "unknown=halt needs num_elites above 1: one never disagrees"
         else:
             return
         raise ValueError(f"dynamics.{why}.")

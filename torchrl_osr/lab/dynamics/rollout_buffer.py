@@ -126,7 +126,7 @@ class RolloutReplayBuffer:
         units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
         limits = self.bounds | {"steps": options.rollout_steps, "units": units}
         rows = rollout(model, act, starts, **limits)
-        penalty = options.penalty * data.reward_scale
+        penalty = options.penalty * abs(data.reward_scale)
         rows["next", "reward"] -= penalty * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)
         if self.n_steps > 1:
@@ -139,7 +139,7 @@ class RolloutReplayBuffer:
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed((self.data.seed << 20) + number)
+            torch.manual_seed(((self.data.seed << 20) + number) % 2**63)
             return self.roll_out(self._copy)
 
     def _keep(self, rollouts: list[TensorDict]) -> None:

@@ -61,6 +61,10 @@ class EliteNetworks:
     def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
         """Return the networks of several models as one; their layers must be alike."""
         joined = copy(parts[0])
+        if len({tuple(w.shape[1:] for w in each.weights) for each in parts}) > 1:
+            raise ValueError(
+                "The models differ in layers: choose runs of equal dynamics.num_cells."
+            )
         weights, biases = zip(*((p.weights, p.biases) for p in parts), strict=True)
         joined.weights = [torch.cat(layer) for layer in zip(*weights, strict=True)]
         joined.biases = [torch.cat(layer) for layer in zip(*biases, strict=True)]

@@ -30,7 +30,8 @@ def inverse_dynamics_report(
     data = data[~data.get(("next", "done")).squeeze(-1)]
     if not len(data):
         raise ValueError(
-            "all held-out rows end an episode: hold out more rows (data.held_out=0.2)."
+            "all held-out rows end an episode: hold out more rows (data.held_out=0.2); "
+            "if all rows do, choose a loss without this model (loss=cql)."
         )
     # Latent variables at their mean, as the policy's losses use the model.
     with set_interaction_type(InteractionType.DETERMINISTIC):

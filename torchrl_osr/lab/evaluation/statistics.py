@@ -149,7 +149,7 @@ def scores_and_decreases(
     return found
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
+def wilson(successes: float, trials: int) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a share."""
     share, square = successes / trials, NORMAL_QUANTILE_975**2 / trials
     half = sqrt(square * (share * (1 - share) + square / 4))
@@ -163,8 +163,8 @@ def recovered_share(
     """Return the recovery rate over states, in percent.
 
     ``back`` ``[N, M]`` has the rate of each seed and state. Seeds are resampled, and
-    walks with all of their states. If the rate is 0 or 1 everywhere, the interval is
-    Wilson's, with the walks as trials.
+    walks with all of their states. If no resample differs, the interval is Wilson's,
+    with the walks as trials.
 
     With the rates of a ``baseline``, of the same seeds, return R instead: the share of
     the baseline's failures that is avoided.
@@ -178,10 +178,6 @@ def recovered_share(
     theirs, over = 0 * ours, over_what(len(ours), alone="walks")
     if baseline is not None:
         theirs = np.asarray(baseline, np.float64) @ member
-    elif not ours.any() or (ours == sizes).all():
-        share = int(ours.any())
-        low, high = wilson(share * len(walks), len(walks))
-        return Estimate(100 * share, 100 * low, 100 * high, over)
     rng = np.random.default_rng(0)
     # How often each seed and walk is drawn: once, then in each resample.
     by_seed, by_walk = (
@@ -195,4 +191,7 @@ def recovered_share(
     if (lost <= 0).any():
         raise ValueError("The baseline saves all states: R is not defined.")
     shares = 100 * (saved - before) / lost
+    if baseline is None and np.ptp(shares) < 1e-9:
+        low, high = wilson(shares[0] / 100 * len(walks), len(walks))
+        return Estimate(float(shares[0]), 100 * low, 100 * high, over)
     return interval(shares[0], shares[1:], over)

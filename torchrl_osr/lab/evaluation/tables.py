@@ -29,7 +29,7 @@ def run_summary(
 
     def text(row: Mapping[str, Any]) -> str:
         mean, low, high = (row[f"{measure}{end}"] for end in ("", "_low", "_high"))
-        return f"{mean:6.1f}  [{low:.1f}, {high:.1f}]"
+        return f"{mean:6.1f}" + f"  [{low:.1f}, {high:.1f}]" * bool(low < high)
 
     trained = [row[measure] for row in history if row["step"]]
     recent = (trained or [last[measure]])[-NUM_RECENT:]

@@ -113,6 +113,8 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     elif dynamics.xml and (dynamics.adversarial_steps or differentiated):
         why = f"{name} needs gradients of the model, and a body has none:"
         why += " choose dynamics=ensemble"
+    elif config.optim.policy_delay > config.trainer.steps:
+        why = "optim.policy_delay is above trainer.steps: the policy would not move"
     if why:
         raise ValueError(f"{why}.")
     if dynamics.use:

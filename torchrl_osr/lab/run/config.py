@@ -35,7 +35,9 @@ TARGET_PACKAGES = (
 """Packages whose public names are allowed as ``_target_``: none of them reads a file or
 imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 
-MAY_BE_0 = ("dynamics.adversarial_steps", "dynamics.perturbed_start_steps")
+MAY_BE_0 = (
+    *("dynamics.adversarial_steps", "dynamics.perturbed_start_steps", "data.seed"),
+)
 SHARES = (
     *("data.random_share", "data.held_out", "dynamics.real_ratio"),
     *("dynamics.known_share", "optim.gamma", "optim.tau", "optim.policy_average"),
@@ -70,9 +72,12 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     made = cast(TrainConfig, OmegaConf.to_object(typed))
     # Others would train nonsense, or fail hours later.
     for key, value in flatten(asdict(made)).items():
-        positive = key.startswith(("trainer.", "dynamics.", "optim.", "data.num"))
+        groups = "trainer.", "dynamics.", "optim.", "data.num", "data.seed"
+        positive = key.startswith(groups)
         if key in CHOICES:
             check_choice(key, value, CHOICES[key])
+        elif key == "data.reward_scale" and not value:
+            raise ValueError("data.reward_scale must not be 0.")
         elif key in SHARES and not 0 <= value <= 1:
             raise ValueError(f"{key} must be between 0 and 1, got {value}.")
         elif positive and type(value) is int:
@@ -157,8 +162,8 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
             owner = str(target).rpartition(".")[0]
             raise ValueError(
                 f"the configuration names _target_={target}, which is no public name "
-                f"of {', '.join([*TARGET_PACKAGES, *trust])}: allow it with "
-                f"trust=[{owner}] if you know that module."
+                f"of {', '.join([*TARGET_PACKAGES, *trust])}: correct it, or allow it "
+                f"with trust=[{owner}] (--trust {owner}) if you know that module."
             )
 
 

@@ -72,11 +72,14 @@ def load_data(
         reading["action_bounds"] = options.action_bounds or "log"
     data, manifest = load_dataset(**reading, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):
-        place = "" if options.path is None else f" data.path={options.path}"
+        place = cure = ""
+        if options.path is not None:
+            place = f" data.path={options.path}"
+            cure = "give data.path=<place of these> (evaluate-offline: --data), "
         raise ValueError(
             f"data={options.source}{place} has other contents than those that the run "
-            "began with: give data.path=<place of these>, begin another run with "
-            "hydra.run.dir=<folder>, or continue with 'resume=<its folder> force=true'."
+            f"began with: {cure}begin another run in another folder, or train on with "
+            "'torchrl-osr train resume=<its folder> force=true trainer.steps=<more>'."
         )
     return data, manifest
 
@@ -115,6 +118,11 @@ def load_training_data(
     rewarded = not in_keys or ("next", "reward") in in_keys or config.dynamics.use
     if rewarded and not has_rewards(manifest):
         raise ValueError(NO_REWARDS)
+    if not rewarded and ("next", "done") in in_keys and data["next", "done"].all():
+        raise ValueError(
+            "every row ends an episode, and a recovery term skips such rows: choose "
+            "loss=bc."
+        )
     loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)
     reward = options.reward_scale * data["next", "reward"] + options.reward_shift
 

@@ -8,7 +8,7 @@ import platform
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from glob import glob
 from importlib.metadata import version
 from pathlib import Path
@@ -88,7 +88,7 @@ def open_run(
         cfg.data.path = _absolute(cfg.data.path)
         cfg.dynamics.xml = _absolute(cfg.dynamics.xml)
         config = checked(cfg, trust)
-        new, known = not (folder / CONFIG).exists(), config.data
+        new, finished = not (folder / CONFIG).exists(), None
         if config.env.id is not None:
             set_sizes_from_environment(config.env)
         elif new or config.force:
@@ -99,20 +99,22 @@ def open_run(
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
         else:
-            known = (run := read_run(folder, trust)).data
+            run = read_run(folder, trust)
+            if read_status(folder)["status"] == "done":
+                finished = run.trainer.steps
             if config.env.id is None and not config.force:
                 for name in EnvironmentSpec._fields:
                     setattr(config.env, name, getattr(run.env, name))
-            config.data.checksum = None if config.force else known.checksum
-            config.data.observation_names = known.observation_names
+            config.data.checksum = None if config.force else run.data.checksum
+            config.data.observation_names = run.data.observation_names
             _check_same(run, config, folder)
-        # Last: config.yaml makes the folder a run's. A new data.path is stored later,
-        # when the data's checksum has been compared.
-        there = replace(config.data, path=known.path)
-        write_config(folder, replace(config, data=there))
+        # Last: config.yaml makes the folder a run's. What differs in a continued run is
+        # stored later, when the data's checksum has been compared.
+        if new:
+            write_config(folder, config)
         choices = read_yaml(folder / HYDRA)["hydra"]["runtime"]["choices"]
         method = method_name(choices["loss"], choices.get("recovery"))
-        with _status(folder):
+        with _status(folder, finished):
             try:
                 yield Run(config, folder, method)
             except Exception:
@@ -196,8 +198,11 @@ def _lock(folder: Path) -> AbstractContextManager[Any]:
 
 
 @contextmanager
-def _status(folder: Path) -> Iterator[None]:
-    """Keep ``status.json`` true; log the command that continues a preempted run."""
+def _status(folder: Path, finished: int | None) -> Iterator[None]:
+    """Keep ``status.json`` true; log the command that continues a preempted run.
+
+    A run that has ``finished`` so many steps stays done if more are refused.
+    """
     running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
     with signals_raised():
         try:
@@ -212,6 +217,8 @@ def _status(folder: Path) -> Iterator[None]:
                 end = {"status": "preempted", "reason": error.reason}
                 resume = shlex.quote(f"resume={folder}")
                 log.warning(f"Continue with: torchrl-osr train {resume}")
+            elif finished and finished == read_config(folder)["trainer"]["steps"]:
+                end = {"status": "done"}
             with signals_noted():
                 write_json(folder / STATUS, end)
             raise

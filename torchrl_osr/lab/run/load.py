@@ -75,7 +75,7 @@ def load_trained(path: Path | str, *, trust: Sequence[str] = ()) -> TrainedRun:
     config = read_run(run_folder_of(path), trust)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     if damage := find_damage(path):
-        raise CheckpointError(f"{path} is damaged: {damage}. Take another checkpoint.")
+        raise CheckpointError(f"{path} is damaged: {damage}. Take another .torchrl.")
     with torch.random.fork_rng(devices=[]):
         learner = make_learner(config)
     shape = [config.env.observation_size or 0] if config.data.standardize else []
@@ -115,7 +115,7 @@ def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:
 def policy_of(run: TrainedRun) -> Policy:
     """Copy the policy of a run, in the units of its environment."""
     config, env = run.config, run.config.env
-    source = {"env_id": env.id or env.name, "seed": config.seed, "step": run.step}
+    source: dict[str, Any] = {"env_id": env.id, "seed": config.seed, "step": run.step}
     source |= {"checkpoint": run.path.name, "discount": config.optim.gamma}
     # Without the place of a log on this machine.
     source |= {"data": asdict(config.data) | {"path": None}}

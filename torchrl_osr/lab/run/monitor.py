@@ -39,6 +39,11 @@ def monitor_of_run(
     env = replace(config.env, id=None)  # its bounds are known: no simulator is made
     data, _ = load_data(env, log)
     episode, counts = rows_of(data, options.fall_steps)
+    if left_out := int((~counts).sum()):
+        print(
+            f"{left_out:,} rows in the {options.fall_steps} steps before a terminal "
+            "state count as falls; if those are goals, give monitor.fall_steps=0"
+        )
     rate, states = options.false_alarms, data["observation"][:]
     wanted = rate if options.episodes is None else None
     monitor = fit_monitor(states, episode, counts, false_alarms=wanted, seed=log.seed)
@@ -57,11 +62,6 @@ def monitor_of_run(
         f"monitor: an alarm beyond {monitor.threshold:.3g}, in at most {rate:.3g} of "
         f"episodes like the {monitor.record['episodes']:,} {source}"
     )
-    if left_out := int((~counts).sum()):
-        print(
-            f"{left_out:,} rows in the {options.fall_steps} steps before a terminal "
-            "state count as falls; if those are goals, give monitor.fall_steps=0"
-        )
     return monitor
 
 

@@ -285,7 +285,8 @@ def schema_of(target: type) -> type:
 def _config_type(annotation: Any) -> Any:
     """Return an annotation that OmegaConf can check: a plain or optional type."""
     if get_origin(annotation) is Literal:
-        return StrEnum("choice", [*get_args(annotation)])
+        # A trainer cannot go backward from one loss for each row.
+        return StrEnum("choice", [x for x in get_args(annotation) if x != "none"])
     parts = {*get_args(annotation)} - {NoneType} or {annotation}
     return annotation if parts < {bool, int, float, str} else Any
 
@@ -301,7 +302,7 @@ def register() -> None:
     for name, chosen in LOSSES.items():
         store.store(group="schema", name=name, node=schema_of(chosen))
     resolvers: dict[str, Callable[..., Any]] = {
-        "environment_name": environment_name,
+        "environment_name": lambda env_id: environment_name(env_id or "log"),
         # Never that of a task, which has settings and scores.
         "log_name": lambda path: "log-" + re.sub(r"\W+", "-", Path(str(path)).stem),
         "run_dir": _run_dir,

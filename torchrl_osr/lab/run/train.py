@@ -14,6 +14,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -70,6 +71,11 @@ def train(run: Run) -> float:
     return report(run, phases.data.data_mean, trainer)
 
 
+def saved(norm: ObservationNorm) -> Any:
+    """Return what a checkpoint saves and does not restore: the rows have this norm."""
+    return SimpleNamespace(state_dict=norm.state_dict, load_state_dict=lambda _: None)
+
+
 class Phases:
     """The phases of a run's training, and what they share: networks, data, options."""
 
@@ -114,7 +120,7 @@ class Phases:
             autocast_dtype=self.autocast,
             trace=config.trainer.record,
         )
-        kept = {"perturbation": self.perturbation, "observation_norm": data.norm}
+        kept = {"perturbation": self.perturbation, "observation_norm": saved(data.norm)}
         return OfflineTrainer(
             update,
             folder=self.run.folder / "checkpoint" / name,
