@@ -56,8 +56,8 @@ def evaluate_paired(
 
     Episodes of a pair have the same seed and start state, and the policy is called
     with batches of one size. Until the disturbance acts, those of a deterministic
-    policy are equal, bit for bit.
-    Warn if the environment ignores its seed. The policy is called on the CPU.
+    policy are equal, bit for bit. Warn if the environment ignores its seed. The policy
+    is called on the CPU.
 
     Keyword Args:
         num_episodes, seed: see :class:`~torchrl_osr.lab.evaluation.EpisodeEvaluator`.

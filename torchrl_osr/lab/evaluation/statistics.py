@@ -157,6 +157,14 @@ def wilson(successes: float, trials: int) -> tuple[float, float]:
     return max(0.0, low / (1 + square)), min(1.0, high / (1 + square))
 
 
+def never_certain(percent: Estimate, trials: int) -> Estimate:
+    """Return a share with Wilson's interval if no resample differs from it."""
+    if percent.high - percent.low > 1e-9:
+        return percent
+    low, high = wilson(percent.mean / 100 * trials, trials)
+    return percent._replace(low=100 * low, high=100 * high)
+
+
 def recovered_share(
     back: ArrayLike, walk: ArrayLike, baseline: ArrayLike | None = None
 ) -> Estimate:
@@ -191,7 +199,5 @@ def recovered_share(
     if (lost <= 0).any():
         raise ValueError("The baseline saves all states: R is not defined.")
     shares = 100 * (saved - before) / lost
-    if baseline is None and np.ptp(shares) < 1e-9:
-        low, high = wilson(shares[0] / 100 * len(walks), len(walks))
-        return Estimate(float(shares[0]), 100 * low, 100 * high, over)
-    return interval(shares[0], shares[1:], over)
+    found = interval(shares[0], shares[1:], over)
+    return found if baseline is not None else never_certain(found, len(walks))

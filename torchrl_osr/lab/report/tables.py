@@ -19,9 +19,9 @@ from torchrl_osr.lab.evaluation.statistics import (
     decimal,
     estimate,
     nested_mean,
+    never_certain,
     recovered_share,
     scores_and_decreases,
-    wilson,
 )
 from torchrl_osr.lab.evaluation.tables import NUM_RECENT
 from torchrl_osr.lab.report.runs import SAVED, RunTables
@@ -96,10 +96,7 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     shares = there.groupby("run")[columns].mean().mean()  # runs have equal weight
     back = 100.0 * (there["recovery_steps"] <= STEPS_AFTER)
     runs = [run.to_numpy() for _, run in back.groupby(there["run"], sort=False)]
-    recovered, most = nested_mean([runs]), max(map(len, runs))
-    if recovered.low == recovered.high:  # no resample differs
-        low, high = wilson(recovered.mean / 100 * most, most)
-        recovered = recovered._replace(low=100 * low, high=100 * high)
+    recovered = never_certain(nested_mean([runs]), max(map(len, runs)))
     median = there["recovery_steps"].fillna(np.inf).median()
     return {
         "stood %": 100 * shares["survived_knock"],

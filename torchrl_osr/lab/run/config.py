@@ -36,8 +36,8 @@ TARGET_PACKAGES = (
 imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 
 MAY_BE_0 = (
-    *("dynamics.adversarial_steps", "dynamics.perturbed_start_steps", "data.seed"),
-)
+    "data.seed", "dynamics.adversarial_steps", "dynamics.perturbed_start_steps",
+)  # fmt: skip
 SHARES = (
     *("data.random_share", "data.held_out", "dynamics.real_ratio"),
     *("dynamics.known_share", "optim.gamma", "optim.tau", "optim.policy_average"),
