@@ -39,7 +39,9 @@ from torchrl_osr.lab.data import (
 from torchrl_osr.lab.data.environment import known_ids
 from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 
-OmegaConf.register_new_resolver("frames", lambda steps, rows: steps * rows)
+OmegaConf.register_new_resolver(
+    "frames", lambda steps, rows: steps * rows, replace=True
+)
 
 
 class ReplayBufferCollector(BaseCollector):

@@ -67,19 +67,19 @@ class StatePerturbation(Transform):
 
     def __init__(
         self,
-        std: float | Sequence[float],
+        std: float | Sequence[float] | Tensor,
         *,
         in_keys: Sequence[NestedKey] = ("observation",),
         perturbed: NestedKey = "perturbed",
         seed: int | None = None,
     ) -> None:
-        numbers = torch.as_tensor(std, dtype=torch.float64)
+        numbers = torch.as_tensor(std, dtype=torch.float64, device="cpu")
         for each in numbers.flatten().tolist():
             check_weight("std", each)
         keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         perturbed_keys = [nested(perturbed, key) for key in keys]
         super().__init__(in_keys=keys, out_keys=perturbed_keys)
-        self.register_buffer("std", numbers)
+        self.register_buffer("std", numbers.to(torch.get_default_dtype(), copy=True))
         self.seed = _derived("new", next(_number)) if seed is None else seed
         self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None
@@ -90,7 +90,9 @@ class StatePerturbation(Transform):
         self._copies += 1
         state: dict[str, Any] = super().__getstate__()
         own = {"seed": _derived("copy", self.seed, self._copies), "_copies": 0}
-        return state | own | {"_generator": None, "_loaded": None}
+        # TorchRL copies transforms to find a parent: the environment is left out.
+        none = dict.fromkeys(("_generator", "_loaded", "_container", "_parent"))
+        return state | own | none
 
     def clone(self) -> Self:
         """Return a copy, for another environment."""

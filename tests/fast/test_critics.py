@@ -10,7 +10,9 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
+from torchrl_osr import CQLLoss
 from torchrl_osr.fast import critics, fuse_critics
+from torchrl_osr.objectives.actor_critic import Critics
 
 CELLS = [8, 6, 4]
 
@@ -166,3 +168,35 @@ def test_critics_with_a_hook_go_as_modules(calls):
         handle.remove()
     loss(batch)
     assert calls
+
+
+def test_what_users_override_is_used(calls) -> None:
+    class Halved(CQLLoss):
+        def critic_output(self, *given):
+            return super().critic_output(*given) / 2
+
+    loss, batch = make_loss(), make_batch("cql", 7)
+    loss.__class__ = Halved
+    wanted = loss(batch)["pred_value"]
+    fuse_critics(loss)
+    assert loss(batch)["pred_value"] == wanted
+    assert not calls
+    loss.critics = own = Critics(loss)
+    own.__class__ = type("Own", (Critics,), {})
+    fuse_critics(loss)
+    assert loss.critics is own
+
+
+def test_sampled_actions_get_their_gradient() -> None:
+    loss, batch, found = make_loss(), make_batch("cql", 5), []
+    states, compared = batch.select("observation"), batch["action"]
+    for _ in range(2):
+        action = compared.repeat(3, 1, 1).requires_grad_()
+        drawn = action, action.new_zeros(3, 5)
+        terms = loss.critics.values_and_soft_maximum(
+            states, compared, *drawn, alike=True
+        )
+        found += torch.autograd.grad(terms[1].sum(), action)
+        fuse_critics(loss)
+    assert found[0].any()
+    torch.testing.assert_close(*found)

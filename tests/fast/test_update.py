@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 import torch
 from objectives.losses import Networks, assert_same_bits, call, make_batch, make_loss
@@ -120,8 +122,9 @@ def test_a_gradient_of_a_finite_loss_is_named() -> None:
         return losses
 
     loss.forward = forward
-    with pytest.raises(NonfiniteError, match=f"losses none; gradients {name}"):
+    with pytest.raises(NonfiniteError, match=f"losses none; gradients {name}") as end:
         FastUpdate(loss, adam(loss.parameters()))(make_batch("osr", 5))
+    assert str(pickle.loads(pickle.dumps(end.value))) == str(end.value)
 
 
 # What tensordict 0.14.3 and torch.compile print when they trace.

@@ -104,12 +104,13 @@ class Plain:
     @torch.no_grad()
     def soft_value(self, batch, *, entropy: bool, number: int = 1) -> Tensor:
         """Return what SAC's target bootstraps from, the best of a number, ``[R]``."""
-        state, found = following(batch), []
+        state, best, of_best = following(batch), torch.tensor(-math.inf), 0.0
         for noise in torch.randn(number, len(state), 2, dtype=torch.float64):
             action, log_prob = self.act(self.policy(state), noise)
             lowest = self.values(state, action, self.targets).amin(0)
-            found.append(lowest - ALPHA * log_prob if entropy else lowest)
-        return torch.stack(found).amax(0)
+            of_best = torch.where(lowest > best, log_prob, of_best)
+            best = torch.maximum(lowest, best)
+        return best - ALPHA * of_best if entropy else best
 
     def td_loss(self, batch: TensorDict, next_value: Tensor) -> Tensor:
         """Return the squared TD error, summed over critics."""

@@ -27,6 +27,7 @@ VARIANTS = {
     "CQL(H) with its options: temperature": {"temperature": 0.6},
     "CQL(H) with its options: clipped": {"clip_diff_min": 5.9},
     "CQL(H) with its options: max backup": {"max_q_backup": True},
+    "CQL(H) with its options: soft max backup": ENSEMBLE | {"max_q_backup": True},
     "CQL(H) with its options: entropy": {"deterministic_backup": False},
     "CQL(H) with its options: gap": {"target_action_gap": 2.0},
     "CQL(H) with its options: all": ALL,

@@ -164,6 +164,22 @@ def test_beside_torchrls_losses_the_actor_gets_both_gradients(kind) -> None:
         assert extra.any() == key.startswith("actor_network_params"), key
 
 
+def test_a_pair_has_the_estimator_and_the_parameters_of_its_parts() -> None:
+    pair, batch = make_loss("official"), make_batch("official", 10)
+    pair.make_value_estimator(gamma=0.5)
+    assert pair.value_estimator is pair.loss.value_estimator
+    assert pair.value_estimator.gamma == 0.5
+    given = {
+        "_".join([key] if isinstance(key, str) else key): batch[key]
+        for key in pair.in_keys
+    }
+    assert pair(**given) is not None
+    matrices = [each for each in pair.parameters() if each.ndim > 1]
+    before = [each.clone() for each in matrices]
+    pair.reset_parameters_recursive()
+    assert not any(map(torch.equal, before, matrices))
+
+
 def test_a_model_and_one_actor_are_asked_for() -> None:
     first, second = (make_loss("official") for _ in range(2))
     with pytest.raises(ValueError, match="of another actor than the loss's"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import ObservationNorm
@@ -51,6 +52,15 @@ def test_statistics_and_bounds_that_are_refused(make_loss):
     for bounds in ({"low": 1.0}, {"high": [1.0, float("inf")]}):
         with pytest.raises(ValueError, match="must be below high"):
             policy_from_loss(make_loss("osr"), **bounds)
+
+
+def test_torchs_default_type_is_not_that_of_a_policy(make_loss):
+    loss = make_loss("osr")
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert policy_from_loss(loss).loc.dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_without_critics_it_acts_and_has_no_values(tmp_path):

@@ -9,7 +9,11 @@ import pytest
 import torch
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
+from torchrl_osr.trainers.checkpoints import (
+    GlobalGenerators,
+    find_damage,
+    safe_checkpoint,
+)
 
 
 def test_tensors_are_read_weights_only(tmp_path):
@@ -29,3 +33,11 @@ def test_tensors_are_read_weights_only(tmp_path):
             archive.writestr(name, content)
     with pytest.raises(CheckpointError, match="Weights only load failed"):
         fresh.load(path)
+
+
+def test_generators_continue_on_a_machine_with_other_devices():
+    state = GlobalGenerators().state_dict()
+    wanted = torch.rand(1)
+    absent = dict.fromkeys({"torch_mps", "torch_cuda"} - set(state), state["torch_cpu"])
+    GlobalGenerators().load_state_dict(state | absent)
+    assert torch.rand(1) == wanted

@@ -60,7 +60,7 @@ class FusedCritics(Critics):
             or action.device.type != "cpu"
             or not torch.is_grad_enabled()
             or torch.compiler.is_compiling()
-            or any(value.requires_grad for value in states.values(True, True))
+            or any(x.requires_grad for x in (*sampled, *states.values(True, True)))
         ):
             return super().values_and_soft_maximum(
                 states, compared, *sampled, alike=alike
@@ -86,6 +86,7 @@ class FusedCritics(Critics):
             or len(network.in_keys) != 2
             or network.in_keys[-1] != keys.action
             or keys.state_action_value not in network.out_keys
+            or type(self.loss).critic_output is not ActorCriticLoss.critic_output
             or any(
                 vars(each)[kind]
                 for each in (network, module, *module)
@@ -123,7 +124,7 @@ class FusedCritics(Critics):
 def fuse_critics(loss: nn.Module) -> None:
     """Let a loss, and the losses in it, evaluate their critics by this module."""
     for each in loss.modules():
-        if isinstance(each, ActorCriticLoss):
+        if isinstance(each, ActorCriticLoss) and type(each.critics) is Critics:
             each.critics = FusedCritics(each)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -25,13 +25,6 @@ class NonfiniteError(FloatingPointError):
 
     A GPU is asked once in a hundred updates only: then the weights may be NaN, too.
     """
-
-    def __init__(self, losses: dict[str, float], gradients: list[str]) -> None:
-        bad = [name for name, value in losses.items() if not math.isfinite(value)]
-        super().__init__(
-            f"not finite: losses {', '.join(bad) or 'none'}; gradients "
-            f"{', '.join(gradients[:5]) or 'none'}"
-        )
 
 
 class FastUpdate:
@@ -85,7 +78,7 @@ class FastUpdate:
         target_updater: TargetNetUpdater | None = None,
         *,
         policy_delay: int = 1,
-        policy_params: Sequence[nn.Parameter] = (),
+        policy_params: Iterable[nn.Parameter] = (),
         autocast_dtype: torch.dtype | None = None,
         trace: bool = True,
         warm_up: int = 100,
@@ -150,7 +143,11 @@ class FastUpdate:
         found = dict(zip(map(str, losses.keys()), values, strict=False))
         pairs = zip(trained, values[len(found) :], strict=True)
         bad = [names.get(p, "unnamed") for p, norm in pairs if not math.isfinite(norm)]
-        raise NonfiniteError(found, bad)
+        lost = [name for name, value in found.items() if not math.isfinite(value)]
+        raise NonfiniteError(
+            f"not finite: losses {', '.join(lost) or 'none'}; gradients "
+            f"{', '.join(bad[:5]) or 'none'}"
+        )
 
 
 def hold_bounds(loss_module: LossModule) -> None:

@@ -98,7 +98,7 @@ def cvae_inverse_dynamics(
         I(a \mid s, s', z) = \tanh \mathcal N(\mu, \sigma^2)
 
     It replaces :func:`tanh_gaussian_inverse_dynamics` and also writes the latent's
-    parameters, ``"latent_loc"`` and ``"latent_scale"``, ``[B, Z]``. From these,
+    parameters, ``"latent_loc"`` and ``"latent_scale"``, ``[B, latent_dim]``.
     :class:`~torchrl_osr.InverseDynamicsLoss` adds :math:`KL(q(z) \,\|\, N(0, 1))`.
     ``z`` is drawn under ``set_interaction_type(InteractionType.RANDOM)``, as in
     training. Otherwise, as in the policy's losses, it is the latent's mean.

@@ -173,7 +173,7 @@ class ActorCriticLoss(LossModule):
         self.loss_function: str = loss_function
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
-        self.reduction = reduction
+        self.reduction = reduction or "mean"
         self.critics = Critics(self)
         self._bounds_are_checked = False
 
@@ -545,11 +545,13 @@ class ActorCriticLoss(LossModule):
         action, log_prob = rsample_and_log_prob(pi, number)
         params = self.target_qvalue_network_params
         qvalue = self.q(states.expand(action.shape[:-1]), action, params)
+        if self.max_q_backup:  # the entropy is that of the best action, as in CORL
+            best = F.bootstrap_value(qvalue).argmax(0, keepdim=True)
+            qvalue = qvalue.take_along_dim(best.unsqueeze(0), 1)
+            log_prob = log_prob.take_along_dim(best, 0)
         entropy = () if self.deterministic_backup else (log_prob, self.alpha)
         next_value = F.bootstrap_value(qvalue, *entropy)
-        if self.max_q_backup:
-            next_value = next_value.amax(0)
-        return self.td_target(batch, next_value.squeeze(0))
+        return self.td_target(batch, next_value.flatten())
 
     def td_target(self, batch: Transitions, next_value: Tensor) -> Tensor:
         r"""Return :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[R]``.

@@ -43,8 +43,8 @@ class CQLLoss(ActorCriticLoss):
             their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
 
     Keyword Args:
-        actor_states: where the policy seeks values: ``"clean"`` (default) states, or
-            ``"both"`` for D_tot, which needs perturbed entries.
+        actor_states: where the policy seeks values: ``"clean"`` (default) states,
+            ``"perturbed"``, or ``"both"`` for D_tot; these need perturbed entries.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
             be assigned later. Pass 0 to remove the term permanently.
         num_random: ``K``, actions a kind: uniform, at ``s``, at ``s'``. Default 10.

@@ -48,7 +48,8 @@ class OSRLoss(CQLLoss):
     Keyword Args:
         recovery_weight: weight :math:`\lambda` of the sum over action entries. Default
             0.5, which the released code gives their mean. May be assigned later.
-        actor_states: states of the sought values, ``"both"`` (default) or ``"clean"``.
+        actor_states: states of the sought values: ``"both"`` (default) for D_tot,
+            ``"clean"`` or ``"perturbed"``.
         options: of :class:`~torchrl_osr.CQLLoss`.
 
     Examples:

@@ -9,7 +9,11 @@ import copy
 from typing import Any, Literal, Self
 
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    dispatch,
+)
 from torch import Tensor
 from torchrl.modules import Delta, IndependentNormal, TanhDelta, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
@@ -212,8 +216,7 @@ class WithRecovery(LossModule):
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         # tensordict 0.14.3's TensorDictParams copies without the memo: both parts would
         # have an actor of their own.
-        new = copy.copy(self)
-        new._modules = {}
+        new = type(self)(self.loss, self.recovery)
         new.loss = copy.deepcopy(self.loss, memo)
         new.recovery = copy.deepcopy(self.recovery, memo)
         new.recovery.actor_network_params = new.loss.actor_network_params
@@ -229,11 +232,22 @@ class WithRecovery(LossModule):
         """The entries that the two write."""
         return [*self.loss.out_keys, *self.recovery.out_keys]
 
+    @property
+    def value_estimator(self) -> Any:
+        """The one of the loss."""
+        return self.loss.value_estimator
+
+    def reset_parameters_recursive(self) -> None:
+        """Draw the parameters of both anew."""
+        for part in (self.loss, self.recovery):
+            part.reset_parameters_recursive()
+
     def make_value_estimator(self, *args: Any, **options: Any) -> Self:
         """Choose the TD target of the loss."""
         self.loss.make_value_estimator(*args, **options)
         return self
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return losses and metrics of both, see ``out_keys``."""
         losses: TensorDictBase = self.loss(tensordict)

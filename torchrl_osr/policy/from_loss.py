@@ -147,8 +147,8 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
     Anything around an MLP would be left out: other layers and other bounds.
     """
     generator = torch.Generator().manual_seed(0)
-    rows = torch.randn(16, policy.observation_size, generator=generator)
-    rows *= torch.logspace(0, 1.5, 16).unsqueeze(1)  # some beyond a clip
+    rows = policy.loc.repeat(16, 1).normal_(generator=generator)
+    rows *= torch.logspace(0, 1.5, 16).to(rows).unsqueeze(1)  # some beyond a clip
     place = next(loss.parameters())
     states = TensorDict({}, [len(rows)], device=place.device)
     states.set(loss.actor_network.in_keys[0], rows.to(place))

@@ -168,7 +168,7 @@ def fit_monitor(
     generator = torch.Generator().manual_seed(seed)
     counts = torch.ones_like(episode, dtype=torch.bool) if counts is None else counts
     numbers = torch.unique(episode)
-    order = numbers[torch.randperm(len(numbers), generator=generator)]
+    order = numbers[torch.randperm(len(numbers), generator=generator, device="cpu")]
     held_out = torch.isin(episode, order[len(order) // 2 :])
     known = (~held_out & counts).nonzero()[:, 0]
     if not len(known):
@@ -176,9 +176,9 @@ def fit_monitor(
             conformal_threshold(torch.zeros(len(order) - len(order) // 2), false_alarms)
         raise ValueError("no rows to fit: it needs two episodes, and rows that count.")
     data = observation[known].float()
-    chosen = torch.randperm(len(data), generator=generator)[:num_states]
+    chosen = torch.randperm(len(data), generator=generator, device="cpu")[:num_states]
     size = {"num_states": len(chosen), "observation_size": data.shape[-1]}
-    monitor = DataMonitor(size)
+    monitor = DataMonitor(size).to(data)
     variance, loc = torch.var_mean(data.double(), 0, correction=0)
     monitor.loc.copy_(loc)
     monitor.scale.copy_(variance.sqrt().clamp_min(SMALLEST_SCALE))

@@ -18,10 +18,27 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    GlobalRNGState,
+)
 from torchrl.data import PrioritizedSampler
 
 log = logging.getLogger(__name__)
+
+
+class GlobalGenerators(GlobalRNGState):
+    """Global random generators; those of devices that are not here are left out."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue the generators of this machine."""
+        here = self.state_dict()
+        state = {name: each for name, each in state_dict.items() if name in here}
+        if "torch_cuda" in state:  # one for each GPU
+            state["torch_cuda"] = state["torch_cuda"][: len(here["torch_cuda"])]
+        super().load_state_dict(state)
 
 
 class WeightsOnlyAdapter(CheckpointAdapter):
@@ -147,7 +164,7 @@ class Checkpoints:
             raise FileNotFoundError(f"{self.folder} was removed or renamed.")
         beside = path.with_name(f".{path.name}.new")
         self._checkpoint.save(beside, **options)
-        with beside.open("rb") as file:
+        with beside.open("r+b") as file:  # Windows refuses to sync what is read
             os.fsync(file.fileno())
         os.replace(beside, path)
 

@@ -65,7 +65,7 @@ def signals_raised() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
         raise Interrupted(
-            f"stopped by {name} before or after training. Run again to continue.",
+            f"stopped by {name} before or after training. Resume to continue.",
             EXIT_CODES[signal.Signals(number)],
         )
 

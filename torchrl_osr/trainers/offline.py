@@ -19,14 +19,17 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import PrioritizedSampler, ReplayBuffer
 from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._files import finite_or_none
 from torchrl_osr.fast import FastUpdate, NonfiniteError
-from torchrl_osr.trainers.checkpoints import Checkpoints, SamplerState
+from torchrl_osr.trainers.checkpoints import (
+    Checkpoints,
+    GlobalGenerators,
+    SamplerState,
+)
 from torchrl_osr.trainers.interruption import EXIT_CODES, Interrupted, signals_noted
 from torchrl_osr.trainers.progress import progress_bar
 
@@ -60,6 +63,7 @@ class OfflineTrainer(Trainer):
     whole checkpoint: networks, optimizer, targets, random generators, the sampler's
     order or priorities, and ``components``. On a CPU with the same libraries it ends
     with the same bits as one that was never killed, if the buffer does not prefetch.
+    TorchRL's ``save_trainer`` and ``load_from_file`` do not apply.
 
     Args:
         update: one gradient step; :class:`~torchrl_osr.fast.FastUpdate` makes it of
@@ -149,7 +153,7 @@ class OfflineTrainer(Trainer):
             **self._model,
             optimizer=update.optimizer,
             sampler=SamplerState(replay_buffer, generator),
-            global_rng=GlobalRNGState(),
+            global_rng=GlobalGenerators(),
             history=self.history,
             progress=self._saved,
         )
@@ -268,7 +272,7 @@ class OfflineTrainer(Trainer):
             self._save(step)
         reason = (
             f"{self.description}: stopped by {number.name} at step {step}; the last "
-            f"checkpoint is {self.checkpoints.latest()}. Run again to continue."
+            f"checkpoint is {self.checkpoints.latest()}. Resume to continue."
         )
         log.warning(reason)
         return Interrupted(reason, EXIT_CODES[number])

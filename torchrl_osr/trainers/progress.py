@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import parent_process
 from typing import Any
 
 from torchrl_osr._checks import needed_by
@@ -36,7 +37,8 @@ def progress_bar(
 ) -> Iterator[Any]:
     """Open tqdm's bar at a step; without a terminal it logs every half minute."""
     options: Any = {"desc": what, "total": total, "unit": unit, "initial": first}
-    if bar and sys.stderr.isatty():
+    # Bars of several processes would write over each other.
+    if bar and sys.stderr.isatty() and parent_process() is None:
         with logging_redirect_tqdm(), tqdm(**options) as shown:
             yield shown
     else:

@@ -52,7 +52,7 @@ def test_a_sweep_names_the_job_that_failed_and_ends_the_others(tmp_path, run, si
     chosen = ["loss=osr_v,sdc,edac_10,iql,rorl", "dynamics=none"]
     given = [*sizes, *chosen, "hydra.sweep.dir=sweep", "-m"]
     output = run(tmp_path, "train", *given, code=1)
-    assert "choose dynamics=ensemble" in output
+    assert re.search(r"/sweep/\S*sdc\S*: .*choose dynamics=ensemble", output)
     assert "Warning" not in output
     folders = list((tmp_path / "sweep").glob("*/returns.json"))
     assert len(folders) == 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import gymnasium
 import numpy as np
@@ -53,6 +54,15 @@ def test_the_body_moves_as_gymnasiums_does() -> None:
     torch.testing.assert_close(found, following, **close)
     exploding = body.in_own_units()(state + 1e3, control)
     assert not (exploding.abs() < 100).any(1).all(), "MuJoCo would reset it"
+
+
+def test_a_description_that_has_changed_is_read_anew(tmp_path) -> None:
+    xml = tmp_path / "robot.xml"
+    for number, mass in enumerate(("1", "2")):
+        geom = f'<geom size="1" mass="{mass}"/>'
+        xml.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
+        os.utime(xml, (number, number))
+        assert Body(str(xml), 1).model.body_mass[1] == float(mass)
 
 
 def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:

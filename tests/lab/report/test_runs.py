@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,8 @@ def break_returns(folder: Path, **entries: object) -> None:
 )  # fmt: skip
 def test_a_foreign_or_damaged_run_is_left_out_with_the_reason(tmp_path, spoil, reason):
     spoil(fakes.write_run(tmp_path / "bad", CURVE))
-    fakes.write_run(tmp_path / "good", CURVE)
+    good = fakes.write_run(tmp_path / "good", CURVE)
+    shutil.copytree(good, good / "wandb" / "run-1" / "files")
     tables = read_runs([tmp_path])
     ((path, why),) = tables.left_out
     assert tables.runs["folder"].tolist() == [str(tmp_path / "good")]

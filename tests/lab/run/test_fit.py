@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from composed import SMALL
 
 from torchrl_osr.lab import fit
@@ -28,7 +29,10 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     (folder / "policy.safetensors").unlink()
     with pytest.raises(ValueError, match=r"reward.*data\.missing"):
         fit({**frame, "reward": [None, *frame["reward"][1:]]}, folder, *small, *given)
-    policy = fit(frame, folder, *small, *given)
+    before = torch.get_rng_state(), torch.get_num_threads()
+    policy = fit(frame, folder, *small, *given, "trainer.num_threads=2")
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert torch.get_num_threads() == before[1]
     state = np.arange(11.0)  # obs_10 comes last, as in the log
     named = dict(zip(states, state, strict=True))
     assert policy.act(named) == policy.act(state) != policy.act(state[::-1])

@@ -81,3 +81,4 @@ def test_wandb_gets_the_run_its_curve_and_its_results(tmp_path, monkeypatch):
     assert logged["curve"] == str(folder / "curve.png")
     assert "policy/score" in logged
     assert run.finish.call_count == 2
+    assert not run.config.update.called, "TorchRL would replace the configuration's env"

@@ -57,5 +57,5 @@ def main(cfg: DictConfig) -> None:
         f"{path}: {len(columns['reward']):,} steps, {len(returns)} episodes, "
         f"return {returns.mean():.1f} ({returns.min():.1f} to {returns.max():.1f})"
     )
-    source = shlex.quote(f"data.path={path}")
+    source = shlex.quote(f"data.path={path.as_posix()}")
     print(f"  torchrl-osr train env.id={env_id} {loss}data=file {source}")

@@ -69,7 +69,8 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
                     handler.handle(logging.makeLogRecord(record))
             if HydraConfig.get().mode is RunMode.RUN:
                 raise SystemExit(sentence(error)) from error
-            print(sentence(error), file=sys.stderr)
+            folder = HydraConfig.get().runtime.output_dir
+            print(f"{folder}: {sentence(error)}", file=sys.stderr)
             raise
 
     return run

@@ -95,7 +95,14 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
         raise ValueError(
             f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}."
         )
-    print(f"  next   torchrl-osr report {shlex.quote(str(config.sweep))}")
+    print(
+        f"  next   torchrl-osr report {shlex.quote(Path(str(config.sweep)).as_posix())}"
+    )
+
+
+def plain(cell: Any) -> str:
+    """Format a cell in characters that every terminal has."""
+    return text(cell).removesuffix(" ᵉ").replace("\N{MINUS SIGN}", "-")
 
 
 def disturbance_table(results: Mapping[str, Any]) -> str:
@@ -106,7 +113,7 @@ def disturbance_table(results: Mapping[str, Any]) -> str:
     table = table.drop(columns=["seeds", "stood %"], errors="ignore")
     for name in ("clean", "disturbed"):  # an interval of each would be too wide
         table[name] = [estimate.mean for estimate in table[name]]
-    cells = table.map(lambda cell: text(cell).removesuffix(" ᵉ")).reset_index()
+    cells = table.map(plain).reset_index()
     clean = evaluations[0]["clean"]
     title = (
         f"{results['env']} {results['data']}, suite {results['suite']}: "
@@ -120,8 +127,8 @@ def disturbance_table(results: Mapping[str, Any]) -> str:
 def recoverable_table(results: Mapping[str, Any]) -> str:
     """Return the report's table of recovery rates as text, of these results alone."""
     rows = saved_states(results).assign(data="", run=0, method="", seed=0)
-    rates = recovery_table(rows).drop(columns="seeds").iloc[0].map(text)
-    lines = [(name, cell.removesuffix(" ᵉ")) for name, cell in rates.items()]
+    rates = recovery_table(rows).drop(columns="seeds").iloc[0]
+    lines = [*rates.map(plain).items()]
     number = len(results["evaluations"])
     title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
     return "\n".join([f"{title}, each played {number} x", *aligned_columns(lines)])

@@ -22,7 +22,7 @@ from typing import Any
 
 from torchrl_osr.lab.evaluation.tables import aligned_columns
 from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
-from torchrl_osr.lab.run.load import checkpoints_of, run_folder_of
+from torchrl_osr.lab.run.load import checkpoints_of
 
 
 def main() -> None:
@@ -33,7 +33,7 @@ def main() -> None:
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: the run's; with --xml 0.997")
-    add("--steps", type=int, help="updates; default: what the discount needs")
+    add("--steps", type=int, help="updates; default: by the discount, with --xml 3000")
     add("--xml", help="description of the robot's body, MJCF")
     add("--frame-skip", type=int, default=1, help="physics steps of an action in it")
     add("--seed", type=int, default=0, help="of the training")
@@ -48,7 +48,7 @@ def main() -> None:
     for run in runs:
         if "=" in str(run) and not run.exists():
             parser.error(f"{run} is no run; options have the form --data PATH.")
-        run_folder_of(run)  # before time is spent
+        checkpoints_of(run)  # before time is spent
     if options.pop("checkpoints"):
         runs = [each for run in runs for each in checkpoints_of(run)]
     evaluate = OfflineEvaluator(**options)
@@ -56,7 +56,7 @@ def main() -> None:
         print(f"{number} of {len(runs)}: {run}", flush=True)
         found = evaluate(run)
         same = (found[key] for key in ("env", "data", "discount", "data_value"))
-        tables[tuple(same)][str(run)] = found
+        tables[tuple(same)][run.as_posix()] = found
     for table in tables.values():
         print("\n" + ranking(table))
 

@@ -6,6 +6,7 @@ Shapes: ``B`` states, ``S`` observation, ``A`` action, ``F`` factors.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -24,7 +25,12 @@ from torch import Tensor
 from torchrl_osr.lab.data.transitions import VECTOR_KEYS
 
 Numbers = Sequence[float]
-compiled = cache(mujoco.MjModel.from_xml_path)
+
+
+@cache
+def compiled(xml: str, changed: float) -> Any:
+    """Return the model of a description, read anew when the file has changed."""
+    return mujoco.MjModel.from_xml_path(xml)
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,8 @@ class Body:
     @cached_property
     def model(self) -> Any:
         """The compiled description, times the factors."""
-        model: Any = deepcopy(compiled(self.xml))
+        changed = os.path.getmtime(self.xml) if os.path.exists(self.xml) else 0.0
+        model: Any = deepcopy(compiled(self.xml, changed))
         # Or an unstable body would be back in its start pose, upright and healthy.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if len(self.factors):

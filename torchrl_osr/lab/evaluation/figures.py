@@ -18,10 +18,12 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
 IN_WORDS = {"score": "normalised score", "return": "return"}
 
 PANELS = {
-    "loss_qvalue": "TD error (critics)",
+    "loss_qvalue": "loss of the critics",
     "loss_cql": "conservative term (critics)",
     "recovery_kl": "state recovery (policy)",
     "recovery_nll": "recovery to the data's actions (policy)",
+    "recovery_error": "recovery to the data's actions (policy)",
+    "recovery_gap": "state recovery (critics)",
     "pred_value": "Q of the data's actions",
 }
 """Logged scalars below the learning curve, and their titles."""
@@ -45,6 +47,7 @@ def learning_curve(
 ) -> None:
     """Draw the score, or return, of the evaluations, and the losses."""
     panels = [name for name in PANELS if scalars.get(name)]
+    panels = panels or [name for name in scalars if name.startswith("loss_")]
     ratios = (2, 1) if history else (1,)
     figure = Figure(figsize=(9, 2.1 * sum(ratios)), layout="constrained")
     grid = figure.add_gridspec(len(ratios), max(len(panels), 1), height_ratios=ratios)
@@ -67,7 +70,7 @@ def learning_curve(
     for column, name in enumerate(panels):
         small = figure.add_subplot(grid[-1, column])
         small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
-        small.set_title(PANELS[name], fontsize=9)
+        small.set_title(PANELS.get(name, name), fontsize=9)
         small.tick_params(labelsize=8)
         small.set_xlabel("updates", fontsize=8)
         small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))

@@ -22,7 +22,7 @@ MARKS = {"better": "▲ ", "worse": "▼ ", "no significant difference": "= "}
 MIN_SEEDS = 5
 """Pairs of runs on each data set below which there is no verdict.
 
-A bootstrap over three seeds covers the true mean in about 76 of 100 cases, over five in
+A bootstrap over three seeds covers the true mean in about 75 of 100 cases, over five in
 83, over ten in 89.
 """
 

@@ -90,8 +90,9 @@ def find_runs(tops: Iterable[Path]) -> list[Path]:
         if not top.exists():
             raise FileNotFoundError(f"{top} does not exist.")
         for path in sorted(top.rglob(CONFIG)):
-            # Hydra keeps a second config.yaml in a hidden folder.
-            if not any(part[0] == "." for part in path.relative_to(top).parts):
+            # Hydra keeps a second config.yaml in a hidden folder, W&B in its own.
+            parts = path.relative_to(top).parts
+            if "wandb" not in parts and not any(part[0] == "." for part in parts):
                 found.setdefault(path.parent.resolve(), path.parent)
     return list(found.values())
 

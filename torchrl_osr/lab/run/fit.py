@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -21,12 +22,14 @@ from torchrl_osr.lab.run.train import train
 from torchrl_osr.policy import Policy
 
 
+@torch.random.fork_rng(devices=[])
 def fit(
     log: Mapping[str, Any] | Path | str, folder: Path | str, *overrides: str
 ) -> Policy:
     """Train a policy on a log, as ``torchrl-osr train env=none data=file`` does.
 
     The same call continues a run that was stopped, and returns a finished one's policy.
+    In a notebook, ``logging.basicConfig(level="INFO")`` shows its progress.
 
     Args:
         log: file of a log, or its columns by their usual names, such as a data frame.
@@ -68,6 +71,10 @@ def fit(
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", given, return_hydra_config=True)
     settings = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
-    with open_run(settings, folder, cfg.hydra) as run:
-        train(run)
+    num_threads = torch.get_num_threads()
+    try:
+        with open_run(settings, folder, cfg.hydra) as run:
+            train(run)
+    finally:
+        torch.set_num_threads(num_threads)
     return load_run_policy(folder)

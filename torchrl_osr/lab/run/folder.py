@@ -215,7 +215,7 @@ def _status(folder: Path, finished: int | None) -> Iterator[None]:
             end = {"status": "failed", "error": f"{type(error).__name__}: {error}"}
             if isinstance(error, Interrupted):
                 end = {"status": "preempted", "reason": error.reason}
-                resume = shlex.quote(f"resume={folder}")
+                resume = shlex.quote(f"resume={folder.as_posix()}")
                 log.warning(f"Continue with: torchrl-osr train {resume}")
             elif finished and finished == read_config(folder)["trainer"]["steps"]:
                 end = {"status": "done"}

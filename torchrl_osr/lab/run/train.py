@@ -278,6 +278,7 @@ def make_loggers(run: Run) -> list[Logger]:
             "reinit": "finish_previous",
             "group": group,
             "config": asdict(config) | {"versions": package_versions()},
+            "log_env_packages": False,  # TorchRL would write them over our "env"
         }
     return [*loggers, get_logger(kind, str(folder), name, wandb_kwargs=options)]
 
