@@ -20,11 +20,15 @@ def check_weight(name: str, weight: float) -> None:
         raise ValueError(f"{name} must be finite and at least 0, got {weight}.")
 
 
-def check_positive(name: str, value: float, *, minimum: float | None = None) -> None:
-    """Raise a ValueError unless 0 < ``value`` < inf, or ``value`` >= ``minimum``."""
-    if minimum is None and not 0 < value < math.inf:
+def check_positive(name: str, value: float) -> None:
+    """Raise a ValueError unless the value is finite and above 0."""
+    if not 0 < value < math.inf:
         raise ValueError(f"{name} must be finite and above 0, got {value}.")
-    if minimum is not None and not value >= minimum:
+
+
+def check_at_least(minimum: float, name: str, value: float) -> None:
+    """Raise a ValueError unless the value is at least ``minimum``."""
+    if not value >= minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
 
 

@@ -13,7 +13,7 @@ from typing import Any, Self
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_osr._checks import check_weight
@@ -135,9 +135,8 @@ class StatePerturbation(Transform):
     ) -> TensorDictBase:
         return self.forward(tensordict_reset)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the perturbed entries: unbounded, of the states' shape."""
-        assert isinstance(observation_spec, Composite)
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             spec = observation_spec[key]
             observation_spec[out_key] = Unbounded(

@@ -84,8 +84,7 @@ class LossGradients:
     def _losses(self, batch: TensorDictBase) -> TensorDictBase:
         enabled = self.autocast_dtype is not None
         with torch.autocast(self.device.type, self.autocast_dtype, enabled=enabled):
-            losses: TensorDictBase = self.loss_module(batch)
-        return losses
+            return self.loss_module(batch)
 
     def _look_for_changes(self) -> None:
         """Forget the trace, and wait again, if the loss has changed."""
@@ -140,8 +139,7 @@ class LossGradients:
         """Return the generator that the loss draws from: torch's own of its device."""
         if self.device.type == "cpu":
             return torch.default_generator
-        generator: torch.Generator = torch.cuda.default_generators[self.device.index]
-        return generator
+        return torch.cuda.default_generators[self.device.index]
 
     def _give_up(self, why: str) -> None:
         self.may_trace, self.trace = False, None

@@ -121,7 +121,7 @@ class FastUpdate:
             self.optimizer.step()
         finally:
             # Also after an error: the next backward must not add to these gradients.
-            self.optimizer.zero_grad(set_to_none=True)
+            self.optimizer.zero_grad()
         if whole:
             self._move_targets()
         return losses
@@ -182,8 +182,7 @@ def _mover(updater: TargetNetUpdater | None) -> Callable[[], None]:
     if updater is None:
         return lambda: None
     if type(updater) is not SoftUpdate:
-        move: Callable[[], None] = updater.step
-        return move
+        return updater.step
     pairs = [
         (updater._targets[f"target_{name}", *rest], source)
         for (name, *rest), source in updater._sources.items(True, True)

@@ -35,7 +35,12 @@ from torchrl.objectives import LossModule, ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_choice, check_positive, check_weight
+from torchrl_osr._checks import (
+    check_at_least,
+    check_choice,
+    check_positive,
+    check_weight,
+)
 from torchrl_osr._entries import column, is_next, nested, state_keys
 from torchrl_osr.objectives.networks import (
     action_bounds,
@@ -153,9 +158,8 @@ class ActorCriticLoss(LossModule):
     _value_estimator_default_keys = (  # set_keys passes these on
         *("value", "reward", "done", "terminated", "steps_to_next_obs"),
     )
-    # Losses without CQL's term.
-    has_cql = max_q_backup = deterministic_backup = False
-    target_action_gap: float | None = None
+    # Losses without CQL's term; TorchRL's CQLTrainer asks for with_lagrange.
+    has_cql = max_q_backup = deterministic_backup = with_lagrange = False
     reads_perturbed = False
 
     def __init__(
@@ -205,7 +209,7 @@ class ActorCriticLoss(LossModule):
         check_networks(qvalue_network=qvalue_network)
         if isinstance(qvalue_network, Sequence):
             self.num_qvalue_nets = len(qvalue_network)
-        check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=1)
+        check_at_least(1, "num_qvalue_nets", self.num_qvalue_nets)
         given = qvalue_network, "qvalue_network", self.num_qvalue_nets
         self.convert_to_functional(*given, create_target_params=True)
         if isinstance(qvalue_network, Sequence) and self.num_qvalue_nets == 1:
@@ -332,7 +336,7 @@ class ActorCriticLoss(LossModule):
         shared = ["alpha", "entropy", "pred_value", "target_value"]
         if self.has_cql:
             losses.append("loss_cql")
-        if self.target_action_gap is not None:
+        if self.with_lagrange:
             losses.append("loss_alpha_prime")
             shared.append("alpha_prime")
         self.declare(losses, [*shared, *metrics])
@@ -455,8 +459,7 @@ class ActorCriticLoss(LossModule):
                 "out_key, or name theirs with set_keys()."
             )
         if not self.deactivate_vmap:
-            value: Tensor = full_precision(self._vmap_qvalue(rows, params)).get(key)
-            return value
+            return full_precision(self._vmap_qvalue(rows, params)).get(key)
         values = []
         # Not TorchRL 0.14.1's loop, which torch.compile traces at every call.
         for each in params.unbind(0):
@@ -465,11 +468,6 @@ class ActorCriticLoss(LossModule):
         return torch.stack(values)
 
     # -- terms ------------------------------------------------------------------------
-
-    @property
-    def with_lagrange(self) -> bool:
-        """Whether ``loss_alpha_prime`` is written; TorchRL's CQLTrainer asks."""
-        return self.target_action_gap is not None
 
     @property
     def frozen_critics(self) -> TensorDictBase:
@@ -561,8 +559,7 @@ class ActorCriticLoss(LossModule):
         """
         rows, after = batch.rows, next_value.unsqueeze(-1)
         column(rows, nested("next", self.tensor_keys.reward))
-        target: Tensor = self.value_estimator.value_estimate(rows, next_value=after)
-        return target.reshape(-1)
+        return self.value_estimator.value_estimate(rows, next_value=after).reshape(-1)
 
     def td_error(
         self, batch: Transitions, pred_value: Tensor, target: Tensor

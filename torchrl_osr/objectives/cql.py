@@ -14,7 +14,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_positive
+from torchrl_osr._checks import check_at_least, check_positive
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.transitions import States, Transitions
 
@@ -86,7 +86,7 @@ class CQLLoss(ActorCriticLoss):
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
-        check_positive("num_random", num_random, minimum=1)
+        check_at_least(1, "num_random", num_random)
         check_positive("temperature", temperature)
         super().__init__(**options)
         self.actor_states: States = actor_states
@@ -95,9 +95,10 @@ class CQLLoss(ActorCriticLoss):
         self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         self.register_coefficient("min_q_weight", min_q_weight)
         self.has_cql = min_q_weight > 0
-        if target_action_gap is not None and not self.has_cql:
+        self.with_lagrange = target_action_gap is not None
+        if self.with_lagrange and not self.has_cql:
             raise ValueError("target_action_gap needs min_q_weight above 0.")
-        if target_action_gap is not None:
+        if self.with_lagrange:
             self.log_alpha_prime = nn.Parameter(self.scalar(0))
         self.num_random, self.temperature = num_random, temperature
         self.target_action_gap, self.clip_diff_min = target_action_gap, clip_diff_min

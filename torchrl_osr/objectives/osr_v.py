@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_choice, check_positive
+from torchrl_osr._checks import check_at_least, check_choice, check_positive
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import check_num_actions
 from torchrl_osr.objectives.transitions import SETS, States, Transitions
@@ -89,7 +89,7 @@ class OSRVLoss(ActorCriticLoss):
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
-        check_positive("num_random", num_random, minimum=1)
+        check_at_least(1, "num_random", num_random)
         check_positive("temperature", temperature)
         check_choice("policy_values", policy_values, ("mean", "cql"))
         check_choice("recovery_target", recovery_target, ("inverse_dynamics", "data"))
@@ -174,5 +174,4 @@ class OSRVLoss(ActorCriticLoss):
             return batch.a.expand(1, 1 + (states == "both"), *batch.a.shape)
         model = self.inverse_dynamics(batch, states)
         check_num_actions("inverse_dynamics_network", model.loc, batch.a)
-        action: Tensor = rsample_and_log_prob(model, (number,))[0]
-        return action
+        return rsample_and_log_prob(model, (number,))[0]

@@ -250,8 +250,7 @@ class WithRecovery(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return losses and metrics of both, see ``out_keys``."""
-        losses: TensorDictBase = self.loss(tensordict)
-        return losses.update(self.recovery(tensordict))
+        return self.loss(tensordict).update(self.recovery(tensordict))
 
 
 def policy_at(

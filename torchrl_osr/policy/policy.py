@@ -102,8 +102,7 @@ class Policy(nn.Module):
             within the bounds; of a discrete policy int64 indices, ``[]`` or ``[B]``.
         """
         given, rows = self._given(observation)
-        result: Array = _like(given, self(rows))
-        return result
+        return _like(given, self(rows))
 
     @torch.no_grad()
     def value(
@@ -121,8 +120,7 @@ class Policy(nn.Module):
         self._check_critics()
         given, rows = self._given(observation)
         actions = self(rows) if action is None else self._actions(action, rows)
-        result: Array = _like(given, self.smallest_value(rows, actions))
-        return result
+        return _like(given, self.smallest_value(rows, actions))
 
     @torch.no_grad()
     def monitor(self, observation: Array | Mapping[str, Any]) -> tuple[Array, Array]:
@@ -319,8 +317,7 @@ def load_policy(path: Path | str) -> Policy:
 def _built(sizes: Mapping[str, Any], inputs: int, outputs: int) -> nn.Module:
     activation = ACTIVATIONS[sizes["activation"]]
     norm, cells = bool(sizes["layer_norm"]), sizes["num_cells"]
-    network: nn.Module = mlp(inputs, outputs, cells, activation, layer_norm=norm)
-    return network
+    return mlp(inputs, outputs, cells, activation, layer_norm=norm)
 
 
 def _onnx(
@@ -339,8 +336,7 @@ def _onnx(
     finally:
         log.setLevel(level)
     onnx.model.metadata_props[RECORD] = record
-    content: bytes = onnx.model_proto.SerializeToString()
-    return content
+    return onnx.model_proto.SerializeToString()
 
 
 def joined(observation: Any, columns: Sequence[str] = ()) -> Any:

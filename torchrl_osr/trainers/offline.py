@@ -253,8 +253,7 @@ class OfflineTrainer(Trainer):
         """Return the next batch; TorchRL's loop has counted this update."""
         if self._signals:
             raise self._interrupted(self.step - 1)
-        batch: TensorDictBase = self.buffer.sample()
-        return batch
+        return self.buffer.sample()
 
     def _update_priority(self, batch: TensorDictBase) -> None:
         # TorchRL 0.14.1 gives rows without a new priority the largest there is.
@@ -351,8 +350,7 @@ class _Stepper(OptimizationStepper):
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         try:
-            losses: TensorDictBase = trainer.update(sub_batch)
-            return losses
+            return trainer.update(sub_batch)
         except NonfiniteError as error:
             raise FloatingPointError(
                 f"{trainer.description}: step {trainer.step}: {error}. Look at the "

@@ -102,6 +102,24 @@ def test_terminations_are_the_simulators(env_id) -> None:
     assert (0 < sum(ended) < 300) == (env_id != "HalfCheetah-v5")
 
 
+def test_mazes_end_at_their_goal() -> None:
+    env = make_environment("PointMaze_UMaze-v3")
+    env.reset(seed=0)
+    bare, generator = env.unwrapped, np.random.default_rng(0)
+    states, ended = [], []
+    for _ in range(100):
+        place = bare.goal + generator.uniform(-0.6, 0.6, 2)
+        bare.point_env.set_state(place, np.zeros(2))
+        state, _, terminated, _, _ = env.step(env.action_space.sample())
+        states.append(state)
+        ended.append(terminated)
+    env.close()
+    rule = termination("PointMaze_UMaze-v3", torch.zeros(2, 8))
+    assert rule(torch.tensor(np.array(states))).tolist() == ended
+    assert 0 < sum(ended) < 100
+    assert rule(torch.full([1, 8], math.nan)).all()
+
+
 def test_a_hopper_that_is_not_a_number_has_fallen() -> None:
     state = torch.full([2, 11], float("nan"))
     assert termination("Hopper-v5", torch.zeros(2, 11))(state).all()

@@ -41,8 +41,7 @@ def main(cfg: DictConfig) -> None:
     if not OmegaConf.is_missing(cfg.env, "id"):
         env = OmegaConf.to_object(cfg.env)
     data, manifest = load_data(env, options, progress=cfg.progress)
-    columns = recorded_columns(data, manifest)
-    entries = columns.agg(["min", "mean", "max", "std"]).T
+    entries = recorded_columns(data, manifest).agg(["min", "mean", "max", "std"]).T
     wrong = [*findings(data, manifest, entries)]
     if env is not None and env.id is not None:
         with closing(make_environment(env.id)) as made:

@@ -68,8 +68,7 @@ def is_followed(data: TensorDictBase) -> Tensor:
 def next_action(data: TensorDictBase) -> Tensor:
     """Return the action ``[N, A]`` of the following row, 0 at an episode's end."""
     check_order(data)
-    action: Tensor = data["action"].roll(-1, 0)
-    return action.masked_fill(data["next", "done"], 0.0)
+    return data["action"].roll(-1, 0).masked_fill(data["next", "done"], 0.0)
 
 
 def check_order(data: TensorDictBase) -> None:
@@ -110,8 +109,7 @@ def multi_step(data: TensorDictBase, *, n_steps: int, gamma: float) -> TensorDic
         last = last + goes_on
         reward += goes_on.unsqueeze(-1) * gamma**step * single[last]
         steps += goes_on
-    found: TensorDict = data["next"][last].set("reward", reward)
-    return found.set("steps", steps.unsqueeze(-1))
+    return data["next"][last].set("reward", reward).set("steps", steps.unsqueeze(-1))
 
 
 def take_multi_step(batch: TensorDictBase) -> TensorDictBase:

@@ -1,6 +1,6 @@
 """Dynamics models: training, rollouts, and policies and losses that use them."""
 
-from torchrl_osr.lab.dynamics.body import Body, identify
+from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (
     DynamicsEnsemble,
@@ -25,7 +25,6 @@ __all__ = [
     "SwitchingPolicy",
     "TransitionVAE",
     "TransitionVAELoss",
-    "identify",
     "rollout",
     "termination",
 ]

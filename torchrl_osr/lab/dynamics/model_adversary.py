@@ -63,8 +63,7 @@ class ModelAdversary:
             torch.manual_seed((SEED + (self.data.seed << 20) + number) % 2**63)
             for step in range(options.adversarial_steps):
                 if step % options.rollout_steps == 0:
-                    rows = self.real.sample(options.batch_size)
-                    state = rows["observation"]
+                    state = self.real.sample(options.batch_size)["observation"]
                 rows = self.real.sample(self.model.num_networks * options.batch_size)
                 likelihood = sum(self.likelihood(rows).values())
                 objective, state = self.objective(state)

@@ -141,8 +141,7 @@ class DynamicsEnsemble(nn.Module):
         In standard deviations of the targets.
         """
         mean = mean[self.elites] / self.target_scale
-        distance: Tensor = (mean - mean.mean(0)).norm(dim=-1)
-        return distance.amax(0)
+        return (mean - mean.mean(0)).norm(dim=-1).amax(0)
 
     def inputs_and_targets(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return ``[B, S + A]`` and ``[B, D]`` of transitions ``[B]``.
@@ -308,8 +307,7 @@ class TransitionVAE(nn.Module):
         """Draw a next state for each state, ``[B, S]``."""
         size = *state.shape[:-1], self.latent_dim
         latent = torch.randn(size, dtype=state.dtype, device=state.device)
-        change: Tensor = self.decoder(state, latent)
-        return state + self.target_loc + self.target_scale * change
+        return state + self.target_loc + self.target_scale * self.decoder(state, latent)
 
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:

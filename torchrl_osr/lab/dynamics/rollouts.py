@@ -39,14 +39,20 @@ def walker2d(observation: Tensor) -> Tensor:
     return ~((height > 0.8) & (height < 2) & (angle.abs() < 1))
 
 
+def maze(observation: Tensor) -> Tensor:
+    """Return where a point or an ant is at the goal of Gymnasium-Robotics' mazes."""
+    position, goal = observation[..., :2], observation[..., 2:4]
+    return ~((position - goal).norm(dim=-1) > 0.45)
+
+
 # The versions 2 to 5 of Gymnasium's tasks agree.
 RULES = {"HalfCheetah": never, "Hopper": hopper, "Walker2d": walker2d}
 
 
 def known_rule(env_id: str | None) -> Termination | None:
     """Return the rule by which a Gymnasium task ends, time limits apart."""
-    found = re.fullmatch(r"(\w+)-v[2-5]", env_id or "")
-    return RULES.get(found[1]) if found else None
+    found = re.fullmatch(r"((?:Ant|Point)Maze)?(\w+)-v[2-5]", env_id or "")
+    return found and (maze if found[1] else RULES.get(found[2]))
 
 
 def termination(
@@ -111,8 +117,7 @@ def action_of(actor: nn.Module, state: Tensor, kind: InteractionType) -> Tensor:
     """Return the actions of an actor at states ``[B, S]``, ``[B, A]``."""
     with set_interaction_type(kind):
         batch = actor(TensorDict({"observation": state}, state.shape[:-1]))
-    action: Tensor = batch["action"]
-    return action
+    return batch["action"]
 
 
 @torch.no_grad()
@@ -187,5 +192,4 @@ def perturbed_starts(
             "The model ends the task after every random action: train it longer "
             "(dynamics.steps)."
         )
-    chosen: Tensor = following[torch.randint(len(following), [len(starts)])]
-    return chosen
+    return following[torch.randint(len(following), [len(starts)])]

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_at_least, check_positive, check_weight
 from torchrl_osr.lab.envs.disturbance import (
     DisturbanceWrapper,
     Env,
@@ -24,7 +24,7 @@ class ActionDelay(DisturbanceWrapper):
     """Delay every action by some steps; execute zeros until the first one arrives."""
 
     def __init__(self, env: Env, steps: int) -> None:
-        check_positive("steps", steps, minimum=0)
+        check_at_least(0, "steps", steps)
         super().__init__(env, always=steps > 0)
         self.box = box_of(env.action_space, "actions")
         self.steps, self.pending = steps, deque[Vector]()

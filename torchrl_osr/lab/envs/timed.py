@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import gymnasium
 import numpy as np
 
-from torchrl_osr._checks import check_choice, check_positive, check_weight
+from torchrl_osr._checks import check_at_least, check_choice, check_weight
 from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.envs.disturbance import (
     DisturbanceWrapper,
@@ -85,7 +85,7 @@ class ActionKnock(TimedDisturbance):
         at: At = 500,
     ) -> None:
         check_choice("mode", mode, ("official", "paper", "torque"))
-        check_positive("steps", steps, minimum=1)
+        check_at_least(1, "steps", steps)
         # The sampler knocks between two steps of the agent, never before the first.
         super().__init__(env, at, first=int(mode == "official"))
         self.steps, self.mode = steps, mode
@@ -141,7 +141,7 @@ class ExternalPush(TimedDisturbance):
         self, env: Env, force: float, *, duration: int, at: At = (100, 600)
     ) -> None:
         check_weight("force", force)
-        check_positive("duration", duration, minimum=1)
+        check_at_least(1, "duration", duration)
         super().__init__(env, at)
         self.bare = mujoco_task(env)
         model = self.bare.model

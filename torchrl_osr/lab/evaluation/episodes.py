@@ -18,7 +18,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr._checks import check_positive
+from torchrl_osr._checks import check_at_least
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.data.environment import make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval
@@ -103,7 +103,7 @@ class EpisodeEvaluator:
         wrap: Wrap | None = None,
         fixed_batch: bool = False,
     ) -> None:
-        check_positive("num_episodes", num_episodes, minimum=1)
+        check_at_least(1, "num_episodes", num_episodes)
         made = (make_environment(env_id) for _ in range(num_episodes))
         self.environments = [each if wrap is None else wrap(each) for each in made]
         self.seeds = seed + np.arange(num_episodes)

@@ -91,5 +91,4 @@ def rolled_out_values(
         state, going = state[goes_on], going[goes_on]
         if not len(going):
             break
-    found: Array = value.double().numpy()
-    return found
+    return value.double().numpy()

@@ -106,8 +106,7 @@ def fitted_values(
     params = loss.target_qvalue_network_params
     with torch.no_grad():
         value = loss.q(states, act(policy, starts, size), params)
-    found: Array = (unit * value).double().numpy()
-    return found
+    return (unit * value).double().numpy()
 
 
 def check_discount(gamma: float) -> None:
@@ -119,8 +118,7 @@ def check_discount(gamma: float) -> None:
 def first_states(data: TensorDict, episode: Tensor) -> Tensor:
     """Return the first state of each of the rows' episodes, ``[E, S]``."""
     first = episode.diff(prepend=episode.new_tensor([-1])) > 0
-    starts: Tensor = data["observation"][first]
-    return starts
+    return data["observation"][first]
 
 
 def act(policy: UnitPolicy, states: Tensor, size: int) -> Tensor:

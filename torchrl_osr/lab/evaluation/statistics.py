@@ -87,8 +87,7 @@ def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
         for size in sorted({*map(len, tables)})
     }
     means = np.stack([share[len(table)] @ table for table in tables])
-    found: Array = means[drawn, np.arange(NUM_RESAMPLES)[:, None]].mean(1)
-    return found
+    return means[drawn, np.arange(NUM_RESAMPLES)[:, None]].mean(1)
 
 
 def estimate(runs: Sequence[Array]) -> Estimate:

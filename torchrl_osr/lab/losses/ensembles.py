@@ -17,7 +17,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_at_least, check_weight
 from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import distribution, full_precision
@@ -75,7 +75,7 @@ class EDACLoss(ActorCriticLoss):
         super().__init__(**options)
         networks = actor_network, qvalue_network
         self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
-        check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
+        check_at_least(2, "num_qvalue_nets", self.num_qvalue_nets)
         self.register_coefficient("diversity_weight", diversity_weight)
         self.declare_soft_actor_critic("diversity")
 
@@ -107,8 +107,7 @@ class EDACLoss(ActorCriticLoss):
         # torch.func, unlike torch.autograd.grad, can be compiled; both can be
         # differentiated once more.
         actions = batch.a.expand(number, -1, -1)
-        found: tuple[Tensor, Tensor] = torch.func.grad(total, has_aux=True)(actions)
-        return found
+        return torch.func.grad(total, has_aux=True)(actions)
 
 
 class RORLLoss(ActorCriticLoss):
@@ -176,12 +175,12 @@ class RORLLoss(ActorCriticLoss):
             if name.endswith(("_reg", "_eps", "_min", "_decay")):
                 check_weight(name, value)
                 setattr(self, name, value)
-        check_positive("num_samples", num_samples, minimum=1)
+        check_at_least(1, "num_samples", num_samples)
         super().__init__(**options)
         networks = actor_network, qvalue_network
         self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         if q_ood_reg:  # one critic has no deviation
-            check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
+            check_at_least(2, "num_qvalue_nets", self.num_qvalue_nets)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
         self.register_buffer("num_updates", self.scalar(0))
         terms = {
@@ -242,8 +241,7 @@ class RORLLoss(ActorCriticLoss):
         difference = self.q(around, action) - q_data.unsqueeze(1)
         rise, fall = difference.clamp(min=0).square(), difference.clamp(max=0).square()
         tau = self.q_smooth_tau
-        penalty: Tensor = (1 - tau) * rise + tau * fall
-        return penalty.mean(0).amax(0)
+        return ((1 - tau) * rise + tau * fall).mean(0).amax(0)
 
     def uncertainty_penalty(self, batch: Transitions) -> Tensor:
         r"""Return the penalty of the policy's actions around a state, ``[R]``.
@@ -257,8 +255,7 @@ class RORLLoss(ActorCriticLoss):
             action, _ = rsample_and_log_prob(pi)
         qvalue = self.q(around, action)
         target = (qvalue - self.uncertainty_weight * qvalue.std(0)).detach()
-        penalty: Tensor = (qvalue - target).square()
-        return penalty.mean(0).mean(0)
+        return (qvalue - target).square().mean((0, 1))
 
     def around(self, batch: Transitions, epsilon: float) -> TensorDictBase:
         """Return perturbed states ``[M, R]``; the draws are the same for all rows."""

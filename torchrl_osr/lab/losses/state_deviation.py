@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_at_least, check_positive, check_weight
 from torchrl_osr._entries import nested, state_keys
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
@@ -89,7 +89,7 @@ class StateDeviationLoss(ActorCriticLoss):
         threshold: float = 0.05,
         **options: Any,
     ) -> None:
-        check_positive("num_samples", num_samples, minimum=1)
+        check_at_least(1, "num_samples", num_samples)
         check_positive("kernel_width", kernel_width)
         check_weight("threshold", threshold)
         super().__init__(**options)

@@ -17,7 +17,7 @@ from torchrl_osr.lab.data import reference_returns
 from torchrl_osr.lab.evaluation.robustness import RECOVERY
 from torchrl_osr.lab.run.config import CONFIG, flatten, read_config, read_yaml
 from torchrl_osr.lab.run.evaluate_offline import OFFLINE
-from torchrl_osr.lab.run.folder import RESUMABLE, read_status
+from torchrl_osr.lab.run.folder import HYDRA, RESUMABLE, read_status
 from torchrl_osr.lab.run.schema import method_name
 
 IGNORED = (
@@ -178,7 +178,7 @@ def _read(folder: Path) -> _Run:
             f"not finished, its status is {status['status']}{''.join(why)}"
         )
     config = flatten(read_config(folder))
-    hydra = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
+    hydra = read_yaml(folder / HYDRA)["hydra"]
     choices = hydra["runtime"]["choices"]
     method = method_name(choices["loss"], choices.get("recovery"))
     returns = read_json(folder / "returns.json")

@@ -71,8 +71,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     def built(part: dict[str, Any]) -> LossModule:
         wanted = inspect.signature(get_class(part["_target_"])).parameters
         given = {name: make() for name, make in networks.items() if name in wanted}
-        loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
-        return loss
+        return instantiate(part, _partial_=True)(**given).to(device)
 
     objective = built(config.loss)
     loss = objective.loss if isinstance(objective, WithRecovery) else objective

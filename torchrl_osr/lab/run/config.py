@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_osr import objectives
-from torchrl_osr._checks import check_choice, check_positive, check_weight
+from torchrl_osr._checks import check_at_least, check_choice, check_weight
 from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.run.schema import TrainConfig
 
@@ -81,7 +81,7 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
         elif key in SHARES and not 0 <= value <= 1:
             raise ValueError(f"{key} must be between 0 and 1, got {value}.")
         elif positive and type(value) is int:
-            check_positive(key, value, minimum=int(key not in MAY_BE_0))
+            check_at_least(int(key not in MAY_BE_0), key, value)
         elif positive and type(value) is float:
             check_weight(key, value)
     return made

@@ -68,7 +68,7 @@ def fit(
         write_atomically(log, content.getvalue())
     place = str(log).replace("'", "\\'")
     given = ["env=none", "data=file", f"data.path='{place}'", *overrides]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(CONF, version_base="1.3"):
         cfg = compose("train", given, return_hydra_config=True)
     settings = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
     num_threads = torch.get_num_threads()

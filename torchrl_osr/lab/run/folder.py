@@ -99,15 +99,15 @@ def open_run(
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
         else:
-            run = read_run(folder, trust)
+            stored = read_run(folder, trust)
             if read_status(folder)["status"] == "done":
-                finished = run.trainer.steps
+                finished = stored.trainer.steps
             if config.env.id is None and not config.force:
                 for name in EnvironmentSpec._fields:
-                    setattr(config.env, name, getattr(run.env, name))
-            config.data.checksum = None if config.force else run.data.checksum
-            config.data.observation_names = run.data.observation_names
-            _check_same(run, config, folder)
+                    setattr(config.env, name, getattr(stored.env, name))
+            config.data.checksum = None if config.force else stored.data.checksum
+            config.data.observation_names = stored.data.observation_names
+            _check_same(stored, config, folder)
         # Last: config.yaml makes the folder a run's. What differs in a continued run is
         # stored later, when the data's checksum has been compared.
         if new:
@@ -151,14 +151,14 @@ def _resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> An
     return there
 
 
-def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
+def _check_same(stored: TrainConfig, config: TrainConfig, folder: Path) -> None:
     """Raise a ValueError that names the settings in which a continued run differs.
 
     :data:`RESUMABLE` may, and with ``force`` all, except that a run never goes back.
     """
-    if config.trainer.steps < run.trainer.steps:
+    if config.trainer.steps < stored.trainer.steps:
         raise ValueError(
-            f"{folder} holds a run with trainer.steps={run.trainer.steps}, and "
+            f"{folder} holds a run with trainer.steps={stored.trainer.steps}, and "
             f"{config.trainer.steps} are fewer: give more, or choose another folder."
         )
     of_one_start = {"resume", "trust", "force", "settings", "data.checksum", *RESUMABLE}
@@ -166,7 +166,7 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
         of_one_start.remove("trainer.steps")
     if config.data.checksum:  # the log may have been moved
         of_one_start.add("data.path")
-    there, now = flatten(asdict(run)), flatten(asdict(config))
+    there, now = flatten(asdict(stored)), flatten(asdict(config))
     different = "; ".join(
         f"{key}: {there.get(key, 'nothing')!r} there, {now.get(key, 'nothing')!r} now"
         for key in sorted(now.keys() | there.keys())

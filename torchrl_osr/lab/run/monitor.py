@@ -44,7 +44,7 @@ def monitor_of_run(
             f"{left_out:,} rows in the {options.fall_steps} steps before a terminal "
             "state count as falls; if those are goals, give monitor.fall_steps=0"
         )
-    rate, states = options.false_alarms, data["observation"][:]
+    rate, states = options.false_alarms, data["observation"]
     wanted = rate if options.episodes is None else None
     monitor = fit_monitor(states, episode, counts, false_alarms=wanted, seed=log.seed)
     source = "held-out episodes of the log"
@@ -57,7 +57,7 @@ def monitor_of_run(
         )  # fmt: skip
         own, _ = load_data(env, log)
         about = rows_of(own, options.fall_steps)
-        monitor.calibrate(own["observation"][:], *about, false_alarms=rate)
+        monitor.calibrate(own["observation"], *about, false_alarms=rate)
     print(
         f"monitor: an alarm beyond {monitor.threshold:.3g}, in at most {rate:.3g} of "
         f"episodes like the {monitor.record['episodes']:,} {source}"

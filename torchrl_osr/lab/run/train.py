@@ -171,16 +171,16 @@ class Phases:
         """Train models of the dynamics, see ``lab/dynamics/training.py``."""
         config, data = self.config, self.data
         model_data = ModelData(
-            data.buffer.storage,
-            data.held_out,
-            data.norm.loc,
-            data.norm.scale,
-            config.data.reward_scale,
-            config.optim.gamma,
-            config.env.id,
-            config.seed,
-            config.env.action_low or -1.0,
-            config.env.action_high or 1.0,
+            storage=data.buffer.storage,
+            held_out=data.held_out,
+            loc=data.norm.loc,
+            scale=data.norm.scale,
+            reward_scale=config.data.reward_scale,
+            gamma=config.optim.gamma,
+            env_id=config.env.id,
+            seed=config.seed,
+            action_low=config.env.action_low or -1.0,
+            action_high=config.env.action_high or 1.0,
         )
         return training.train_dynamics(
             config.dynamics,
