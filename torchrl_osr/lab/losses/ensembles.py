@@ -255,7 +255,7 @@ class RORLLoss(ActorCriticLoss):
             action, _ = rsample_and_log_prob(pi)
         qvalue = self.q(around, action)
         target = (qvalue - self.uncertainty_weight * qvalue.std(0)).detach()
-        return (qvalue - target).square().mean((0, 1))
+        return (qvalue - target).square().mean(0).mean(0)
 
     def around(self, batch: Transitions, epsilon: float) -> TensorDictBase:
         """Return perturbed states ``[M, R]``; the draws are the same for all rows."""
