@@ -7,8 +7,8 @@
 
 Out-of-sample State Recovery keeps a policy close to the states of its data. An inverse
 dynamics model learns which action leads from a state, clean or perturbed, to the next
-state of the data. The policy learns to choose that action, in order to return to the
-data after a push.
+state of the data. The policy learns to choose that action. docs/results.md says how
+little this teaches about pushes.
 
 ``torchrl-osr train`` makes the same run from the same parts, and has the other methods.
 The configuration is in ``conf/``; ``--cfg job --resolve`` prints it.
@@ -155,7 +155,7 @@ def train(run: Run) -> float:
         trainer.train()
 
     # 5. Results: policy.safetensors, returns.json, curve.png and a table.
-    save_policies(run, Learner(actor, model, loss, loss), data.norm)
+    save_policies(run, Learner(actor, model, loss=loss, objective=loss), data.norm)
     return report(run, data.data_mean, trainer)
 
 

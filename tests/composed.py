@@ -38,7 +38,7 @@ def composed(config: str, *overrides: str) -> DictConfig:
 
 def options(group: str) -> list[str]:
     """The names of a group's configurations."""
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    return sorted(x.stem for x in (CONF / group).iterdir() if x.suffix == ".yaml")
 
 
 def configured(*overrides: str) -> TrainConfig:

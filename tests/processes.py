@@ -26,6 +26,7 @@ def own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("OMP_NUM_THREADS", "1")
+        patch.delenv("HYDRA_FULL_ERROR", raising=False)  # it means --debug
         yield
 
 

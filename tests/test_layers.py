@@ -16,7 +16,7 @@ def test_no_file_outside_the_laboratory_imports_it() -> None:
     imports = [
         ast.unparse(node)
         for file in core
-        for node in ast.walk(ast.parse(file.read_text()))
+        for node in ast.walk(ast.parse(file.read_bytes()))
         if isinstance(node, (ast.Import, ast.ImportFrom))
     ]
     assert len(core) > 20

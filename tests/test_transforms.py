@@ -86,7 +86,9 @@ class Rows(torch.utils.data.Dataset):
 
 def of_workers() -> list[torch.Tensor]:
     rows = Rows()
-    loader = torch.utils.data.DataLoader(rows, num_workers=2)
+    loader = torch.utils.data.DataLoader(
+        rows, num_workers=2, multiprocessing_context="fork"
+    )
     return [*[each[0] for each in loader], noise(rows.transform)]
 
 

@@ -242,6 +242,8 @@ def test_a_damaged_newest_checkpoint_is_passed_over(
     resumed = make(folder)
     assert resumed.resume().name == "checkpoint-000000000015.torchrl"
     assert "is damaged" in caplog.text
+    assert resumed.checkpoints.latest().name == "checkpoint-000000000015.torchrl"
+    assert (folder / "checkpoint-000000000020.damaged").exists()
     resumed.train()
     assert_same_bits(state(resumed), wanted)
     for path in folder.glob("checkpoint-*"):
@@ -312,6 +314,15 @@ def test_killed_run_logs_no_step_twice(tmp_path, make, interval, evaluated):
         path.write_text(path.read_text() + ["6", "60,", "60,0.1"][number % 3])
     make_logged("killed").train()
     assert read("killed") == read("undisturbed") != before
+
+
+def test_a_fresh_run_keeps_the_rows_of_another(tmp_path, make):
+    csv = CSVLogger("csv", log_dir=str(tmp_path))
+    path = tmp_path / "csv" / "scalars" / "train" / "loss_qvalue.csv"
+    make(tmp_path / "first", loggers=[csv]).train()
+    before = path.read_text()
+    make(tmp_path / "second", loggers=[csv]).train()
+    assert path.read_text().startswith(before)
 
 
 def test_hooks_run_before_checkpoint_and_evaluation(tmp_path, make):

@@ -50,7 +50,7 @@ class OSRLoss(CQLLoss):
             0.5, which the released code gives their mean. May be assigned later.
         actor_states: states of the sought values: ``"both"`` (default) for D_tot,
             ``"clean"`` or ``"perturbed"``.
-        options: of :class:`~torchrl_osr.CQLLoss`.
+        options: of :class:`~torchrl_osr.CQLLoss`, such as ``min_q_weight``.
 
     Examples:
         >>> import torch

@@ -205,6 +205,8 @@ class Checkpoints:
                     "folder.",
                     error.result,
                 ) from error
+            for later in found[found.index(path) + 1 :]:  # or it would be the newest
+                later.replace(later.with_suffix(".damaged"))
             self._remove_outdated()  # a process may have died of a kill before it could
             return path
         if found:

@@ -215,6 +215,7 @@ class OfflineTrainer(Trainer):
         Rows that a CSV logger wrote after it are cut off, and those of an evaluation at
         its step whose result it lacks: these are repeated.
         """
+        started = self.checkpoints.folder.is_dir()  # or no logged row is this run's
         path = self.checkpoints.restore()
         if path is None and self.step:
             raise RuntimeError("no checkpoint yet: build networks and trainer again.")
@@ -230,7 +231,7 @@ class OfflineTrainer(Trainer):
         self.update.count = step
         repeated = set[str]() if self._is_evaluated() else set().union(*self.history)
         for logger in self.loggers:
-            if isinstance(logger, CSVLogger):
+            if started and isinstance(logger, CSVLogger):
                 folder = Path(logger.experiment.log_dir, "scalars", self.description)
                 cut_back(folder, step if path else -1, repeated)
         return path

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import uuid
-from pathlib import Path
 
 import pytest
 from composed import composed
@@ -95,9 +94,12 @@ def test_error_is_printed_once_and_debug_shows_where(tmp_path, run):
     assert "FileNotFoundError: there is no run" in output
 
 
-def test_a_mistyped_folder_is_not_left_behind_and_home_is_expanded(tmp_path, run):
+def test_a_mistyped_folder_is_not_left_behind_and_home_is_expanded(
+    tmp_path, run, monkeypatch
+):
+    monkeypatch.setenv("HOME", f"{tmp_path}/home")
     output = run(tmp_path, "train", "resume=~/outputs/typo", code=1)
-    start = f"resume={Path.home()}/outputs/typo: there is no config.yaml in it; give"
+    start = f"resume={tmp_path}/home/outputs/typo: there is no config.yaml in it; give"
     assert output.startswith(start)
     given = "data.columns=names.yaml", "data.columns.reward=goal"
     output = run(tmp_path, "data", *given, code=1)

@@ -128,10 +128,11 @@ def test_suites_played_differently_are_not_one_suite(tmp_path):
     assert comparison_notes(fakes.read_all(top)) == []
     path = top / "hopper" / "osr" / "seed1" / "robustness-hand.json"
     content = json.loads(path.read_text())
-    content["evaluations"] = content["evaluations"][:1]
-    fakes.write_json(path, content)
-    fakes.write_json(path.with_name("robustness-renamed.json"), content)
+    earlier, last = content["evaluations"]
+    fakes.write_json(path, content | {"evaluations": [last]})
+    renamed = path.with_name("robustness-renamed.json")
+    fakes.write_json(renamed, content | {"evaluations": [earlier]})
     tables = fakes.read_all(top)
     assert [name.partition(", seeds")[0] for name in tables.suites] == [
-        "hand (checkpoints=last 2", "hand (checkpoints=[7000]", "renamed"
+        "hand (checkpoints=last 2", "hand (checkpoints=last 1", "renamed-at-7000"
     ]  # fmt: skip

@@ -13,6 +13,7 @@ import torch
 from composed import trained
 from recorded_logs import make_columns, save
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr import load_policy
 from torchrl_osr.lab.evaluation import deterministic_policy
@@ -41,6 +42,15 @@ def test_the_last_and_the_best_policy_are_exported(folder):
         there = deterministic_policy(run.actor, run.observation_norm)
         wanted = there(torch.as_tensor(state)).numpy()
         np.testing.assert_allclose(policy.act(state), wanted, atol=1e-6)
+
+
+def test_forced_settings_that_do_not_fit_leave_a_run_as_it_was(tmp_path):
+    folder = trained(tmp_path / "run")
+    names = "config.yaml", "policy.safetensors", "status.json"
+    before = [(folder / name).read_bytes() for name in names]
+    with pytest.raises(CheckpointError, match="does not fit this run"):
+        trained(folder, "network.num_cells=[5]", "trainer.steps=12", "force=true")
+    assert [(folder / name).read_bytes() for name in names] == before
 
 
 def test_tensorboard_has_the_numbers_of_the_csv_files(folder):

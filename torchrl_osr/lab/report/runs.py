@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,11 +90,13 @@ def find_runs(tops: Iterable[Path]) -> list[Path]:
     for top in tops:
         if not top.exists():
             raise FileNotFoundError(f"{top} does not exist.")
-        for path in sorted(top.rglob(CONFIG)):
+        hits = []
+        for folder, below, files in os.walk(top):  # folders may vanish meanwhile
             # Hydra keeps a second config.yaml in a hidden folder, W&B in its own.
-            parts = path.relative_to(top).parts
-            if "wandb" not in parts and not any(part[0] == "." for part in parts):
-                found.setdefault(path.parent.resolve(), path.parent)
+            below[:] = [name for name in below if name[0] != "." and name != "wandb"]
+            hits += [Path(folder)] * (CONFIG in files)
+        for path in sorted(hits):
+            found.setdefault(path.resolve(), path)
     return list(found.values())
 
 
@@ -199,6 +202,8 @@ def _read(folder: Path) -> _Run:
         returns["data_return"] = offline["data_value"]
         kind = "in a body" if "xml" in offline else "by FQE"
         measured = f"{ESTIMATED} {kind} (discount {offline['discount']:g}) of {env}"
+        for key in ("steps", "xml", "frame_skip"):
+            config[f"offline.{key}"] = offline.get(key)
     if not evaluations or evaluations[-1]["step"] != steps:
         at = evaluations[-1]["step"] if evaluations else "none"
         raise ValueError(
@@ -213,6 +218,8 @@ def _read(folder: Path) -> _Run:
     for file in sorted(folder.glob("robustness-*.json")):
         # Named by the file: a renamed one holds other episodes.
         content = read_json(file) | {"suite": file.stem.removeprefix("robustness-")}
+        if (at := content["evaluations"][-1]["step"]) != steps:
+            content["suite"] += f"-at-{at}"
         rows.append(suite_episodes(content))
         protocols.append(_protocol(content, steps))
         versions.append(content["versions"])

@@ -72,7 +72,7 @@ def load_data(
         reading["action_bounds"] = options.action_bounds or "log"
     data, manifest = load_dataset(**reading, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):
-        place = cure = ""
+        place, cure = "", "install the package versions that its train.log names, "
         if options.path is not None:
             place = f" data.path={options.path}"
             cure = "give data.path=<place of these> (evaluate-offline: --data), "

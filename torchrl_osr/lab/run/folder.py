@@ -19,6 +19,7 @@ from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
+from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.lab.data import EnvironmentSpec
@@ -117,9 +118,11 @@ def open_run(
         with _status(folder, finished):
             try:
                 yield Run(config, folder, method)
-            except Exception:
+            except Exception as error:
                 if new and not (folder / "checkpoint").exists():  # nothing was trained
                     (folder / CONFIG).unlink()
+                elif config.force and not new and isinstance(error, CheckpointError):
+                    write_config(folder, stored)  # which its checkpoint fits
                 raise
 
 
@@ -193,7 +196,8 @@ def _lock(folder: Path) -> AbstractContextManager[Any]:
     except Timeout as error:
         raise ValueError(
             f"another process is training in {folder}: wait for its end or stop it, "
-            "or choose another folder."
+            "or choose another folder. If there is none, the file system cannot lock: "
+            f"remove {folder / LOCK}."
         ) from error
 
 

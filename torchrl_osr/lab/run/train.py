@@ -62,7 +62,6 @@ def train(run: Run) -> float:
     if run.config.dynamics.xml:
         env: Any = run.config.env  # the data fit it
         run.config.dynamics.body().check(env.observation_size, env.action_size)
-    (run.folder / POLICY).unlink(missing_ok=True)  # of an earlier, shorter training
     if phases.learner.model is not None:
         phases.train_inverse_dynamics()
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
@@ -212,6 +211,8 @@ class Phases:
         average = averaged(actor, optim.policy_average)
         components = {"schedule": schedule, "policy_average": average}
         hooks: list[Hook] = [
+            # The policy of an earlier, shorter training.
+            ("pre_optim_steps", partial((run.folder / POLICY).unlink, missing_ok=True)),
             divergence_warning(data.largest_reward, optim.gamma),
             ("post_optim", schedule.step),
             ("post_optim", partial(average.update_parameters, actor)),
