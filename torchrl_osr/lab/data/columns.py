@@ -109,7 +109,7 @@ def convert(
         counts.update(numbers)
         rows.append(data)
         episodes.append(of_each)
-    data = torch.cat(rows)
+    data = torch.cat(rows) if rows[1:] else rows[0]
     if not len(data):
         raise ValueError("no row has all values and a next state (next_observation).")
     check_dataset(data)
@@ -151,9 +151,10 @@ def _vanishing(columns: Columns) -> Iterator[str]:
         array = np.reshape(columns[name], (len(columns["reward"]), -1))
         moved = np.diff(array, axis=0) != 0
         lost = moved & (np.diff(array.astype(np.float32), axis=0) == 0)
-        for entry in np.flatnonzero(lost.sum(0) > 0.01 * moved.sum(0)):
+        counts = lost.sum(0)
+        for entry in np.flatnonzero(counts > 0.01 * moved.sum(0)):
             yield (
-                f"{lost.sum(0)[entry]:,} changes of {name}[{entry}] from row to row "
+                f"{counts[entry]:,} changes of {name}[{entry}] from row to row "
                 "vanish in float32: subtract a constant (of a clock, its first value)."
             )
 
@@ -223,7 +224,9 @@ def trajectories(
     if "next_observation" in columns:  # that of a terminated row may be missing
         after, ended = columns["next_observation"], columns["terminated"] == 1
         unknown = (ended & (after != after).all(1))[:, None]
-        columns["next_observation"] = np.where(unknown, columns["observation"], after)
+        if unknown.any():
+            after = np.where(unknown, columns["observation"], after)
+            columns["next_observation"] = after
     lost = _missing(columns, options.missing)
     flagged, ends = _ends(columns)
     trajectory = np.cumsum(np.r_[False, ends[:-1]])

@@ -59,6 +59,7 @@ def read_minari(
         options = replace(options, action_bounds=bounds)
     episodes = [*_read(opened, sorted_space(opened.observation_space), progress)]
     columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
+    del episodes  # as large as the columns
     files = sorted(path for path in here.rglob("*") if path.is_file())
     about = {"source": "minari", "path": str(path)}
     return convert([("", columns)], options, about, files)

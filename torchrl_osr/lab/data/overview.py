@@ -116,7 +116,8 @@ def _about_order(data: TensorDict) -> Iterator[str]:
             "ended: sort them (data.columns.step=...) unless they are single steps."
         )
     parts = data["observation"], data["action"], data["next", "reward"]
-    double = pd.DataFrame(torch.cat(parts, 1).numpy()).duplicated()
+    whole = pd.DataFrame(torch.cat(parts, 1).numpy())
+    double = pd.util.hash_pandas_object(whole, index=False).duplicated()
     if double.mean() > SOME / 10:
         yield (
             f"{double.sum():,} rows, such as {double.idxmax()}, repeat an earlier one: "

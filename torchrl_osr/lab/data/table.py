@@ -94,6 +94,7 @@ def log_parts(
         try:
             arrays = _read(file, chosen)
             rows = assemble(about["columns"], arrays)
+            del arrays  # of other types: as large as the rows
             if not len(rows["action"]):
                 raise ValueError("it holds no rows; expected at least one transition.")
             if step := about["columns"].get("step"):
@@ -183,7 +184,8 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
         )
     named = [name for name in frame if not name.startswith("Unnamed: ")]
     frame = frame[named].rename(columns=lambda name: name.strip(" #"))
-    frame = frame[frame.bfill().notna().any(axis=1)]  # of a spreadsheet's empty end
+    filled = np.flatnonzero(frame.notna().any(axis=1))
+    frame = frame[: filled.max(initial=-1) + 1]  # not a spreadsheet's empty end
     return frame, f"separator {separator!r}, decimal {decimal!r}"
 
 

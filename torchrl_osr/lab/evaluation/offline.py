@@ -5,6 +5,7 @@ Shapes: ``N`` transitions, ``K`` critics, ``E`` episodes.
 
 from __future__ import annotations
 
+import gc
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -68,6 +69,7 @@ def fitted_values(
         2
     """
     check_discount(gamma)
+    gc.collect()  # an earlier trainer is a reference cycle, and holds its rows
     episode = episode_of(data)
     starts = first_states(data, episode)
     number, size = len(starts), data["action"].shape[-1]

@@ -68,8 +68,9 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"an interval needs finite values, got {sample}.")
     rng, size = np.random.default_rng(0), sample.size
-    rows = rng.integers(size, size=(NUM_RESAMPLES, size))
-    return interval(sample.mean(), sample[rows].mean(1))[:3]
+    parts = np.array_split(np.empty(NUM_RESAMPLES), 1 + size // 1000)  # of memory
+    means = [sample[rng.integers(size, size=(len(p), size))].mean(1) for p in parts]
+    return interval(sample.mean(), np.concatenate(means))[:3]
 
 
 def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -59,6 +60,7 @@ def load_data(
     reading["columns"] = read_columns(reading["columns"])
     for name in OF_TRAINING:
         del reading[name]
+    gc.collect()  # an earlier job's trainer is a reference cycle, and holds its rows
     if env is not None:
         reading |= {"env_name": env.name, "env_id": env.id}
         reading["references"] = references_of(env)
@@ -130,9 +132,9 @@ def load_training_data(
         return ObservationNorm(loc, scale, in_keys=list(keys), standard_normal=True)
 
     states = "observation", ("next", "observation")
-    rows = data.copy().set(("next", "reward"), reward)
+    rows = data.set(("next", "reward"), reward)
     if ("next", "action") in in_keys:
-        rows["next", "action"] = next_action(data)
+        rows["next", "action"] = next_action(rows)
     if optim.n_steps > 1:  # what follows a row, before some are held out
         steps = multi_step(rows, n_steps=optim.n_steps, gamma=optim.gamma)
         rows["multi_step"] = norm("observation")(steps)

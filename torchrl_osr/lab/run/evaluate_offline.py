@@ -79,7 +79,8 @@ class OfflineEvaluator:
         check_writable(file.parent)
         key = repr((env, options))  # one file may be read in several ways
         if key not in self._known:
-            self._known = {key: load_data(env, options)}
+            self._known.clear()  # before another set is in memory
+            self._known[key] = load_data(env, options)
         rows, manifest = self._known[key]
         if not has_rewards(manifest):
             raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")

@@ -66,6 +66,7 @@ def fit(
         log = folder / "columns" / digest[:8] / f"{folder.name}.npz"
         log.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(log, content.getvalue())
+        del columns, content  # as large as the log
     place = str(log).replace("'", "\\'")
     given = ["env=none", "data=file", f"data.path='{place}'", *overrides]
     with initialize_config_dir(CONF, version_base="1.3"):
