@@ -95,7 +95,6 @@ def train(run: Run) -> float:
     # state. Both together are the paper's mixed data set D_tot.
     data = load_training_data(config, device)
     write_config(folder, config)  # with the checksum of the data
-    (folder / POLICY).unlink(missing_ok=True)  # of an earlier, shorter training
     perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 
@@ -143,6 +142,8 @@ def train(run: Run) -> float:
             folder / CHECKPOINTS,
             seed=config.seed + 1,
             hooks=[
+                # The policy of an earlier, shorter training.
+                ("pre_optim_steps", partial((folder / POLICY).unlink, missing_ok=True)),
                 divergence_warning(data.largest_reward, optim.gamma),
                 ("post_optim", schedule.step),
                 ("post_optim", partial(average.update_parameters, actor)),

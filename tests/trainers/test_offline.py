@@ -321,7 +321,9 @@ def test_a_fresh_run_keeps_the_rows_of_another(tmp_path, make):
     path = tmp_path / "csv" / "scalars" / "train" / "loss_qvalue.csv"
     make(tmp_path / "first", loggers=[csv]).train()
     before = path.read_text()
-    make(tmp_path / "second", loggers=[csv]).train()
+    second = make(tmp_path / "second", loggers=[csv])
+    second.resume()
+    second.train()
     assert path.read_text().startswith(before)
 
 

@@ -35,8 +35,8 @@ class FastUpdate:
     lines of a training loop for small networks, and on a GPU seven times or more. After
     ``warm_up`` updates it repeats a trace of the tensor operations, on a GPU a CUDA
     graph, with the same bits. On a CPU, plain MLP critics of this package's losses are
-    evaluated in fewer, larger products, which round otherwise. For this, the loss's
-    ``critics`` and the actors' ``distribution_kwargs`` are replaced.
+    evaluated in fewer, larger products, which round otherwise. It replaces the
+    loss's ``critics`` (on a CPU) and its networks' ``distribution_kwargs``.
 
     The trace follows all attributes of the loss. After you change a weight, ``gamma``,
     ``requires_grad`` or a hook, or call ``eval()``, the loss itself runs and is traced

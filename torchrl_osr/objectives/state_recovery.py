@@ -217,6 +217,7 @@ class WithRecovery(LossModule):
         # tensordict 0.14.3's TensorDictParams copies without the memo: both parts would
         # have an actor of their own.
         new = type(self)(self.loss, self.recovery)
+        new.training = self.training
         new.loss = copy.deepcopy(self.loss, memo)
         new.recovery = copy.deepcopy(self.recovery, memo)
         new.recovery.actor_network_params = new.loss.actor_network_params

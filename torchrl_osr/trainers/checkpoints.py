@@ -182,7 +182,8 @@ class Checkpoints:
     def restore(self) -> Path | None:
         """Restore the newest undamaged checkpoint; return its path, if there is one.
 
-        Half-written files of a killed process are removed: only one run uses a folder.
+        Newer damaged ones become ``.damaged``. Half-written files of a killed process
+        are removed: only one run uses a folder.
 
         Raises:
             CheckpointError: if a checkpoint does not fit the components, or every one

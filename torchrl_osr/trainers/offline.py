@@ -146,6 +146,7 @@ class OfflineTrainer(Trainer):
         self.history: list[dict[str, Any]] = []
         self.failed_evaluations: dict[int, str] = {}
         self._saved = {"step": 0}
+        self._started = Path(folder).is_dir()  # or no logged row is this run's
         self._progress = progress
         self._signals: list[Signals] = []
         self._model = {"loss_module": update.loss_module, **(components or {})}
@@ -215,7 +216,6 @@ class OfflineTrainer(Trainer):
         Rows that a CSV logger wrote after it are cut off, and those of an evaluation at
         its step whose result it lacks: these are repeated.
         """
-        started = self.checkpoints.folder.is_dir()  # or no logged row is this run's
         path = self.checkpoints.restore()
         if path is None and self.step:
             raise RuntimeError("no checkpoint yet: build networks and trainer again.")
@@ -231,7 +231,7 @@ class OfflineTrainer(Trainer):
         self.update.count = step
         repeated = set[str]() if self._is_evaluated() else set().union(*self.history)
         for logger in self.loggers:
-            if started and isinstance(logger, CSVLogger):
+            if self._started and isinstance(logger, CSVLogger):
                 folder = Path(logger.experiment.log_dir, "scalars", self.description)
                 cut_back(folder, step if path else -1, repeated)
         return path

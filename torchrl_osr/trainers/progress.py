@@ -35,7 +35,7 @@ class _Lines(tqdm):
 def progress_bar(
     what: str, total: int, *, first: int = 0, unit: str = "step", bar: bool = True
 ) -> Iterator[Any]:
-    """Open tqdm's bar at a step; without a terminal it logs every half minute."""
+    """Open tqdm's bar at a step; off a terminal or in a child process, log at times."""
     options: Any = {"desc": what, "total": total, "unit": unit, "initial": first}
     # Bars of several processes would write over each other.
     if bar and sys.stderr.isatty() and parent_process() is None:

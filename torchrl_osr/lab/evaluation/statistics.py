@@ -68,8 +68,8 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"an interval needs finite values, got {sample}.")
     rng, size = np.random.default_rng(0), sample.size
-    parts = np.array_split(np.empty(NUM_RESAMPLES), 1 + size // 1000)  # of memory
-    means = [sample[rng.integers(size, size=(len(p), size))].mean(1) for p in parts]
+    sizes = map(len, np.array_split(range(NUM_RESAMPLES), 1 + size // 1000))
+    means = [sample[rng.integers(size, size=(n, size))].mean(1) for n in sizes]
     return interval(sample.mean(), np.concatenate(means))[:3]
 
 

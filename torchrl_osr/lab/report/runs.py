@@ -92,9 +92,10 @@ def find_runs(tops: Iterable[Path]) -> list[Path]:
             raise FileNotFoundError(f"{top} does not exist.")
         hits = []
         for folder, below, files in os.walk(top):  # folders may vanish meanwhile
-            # Hydra keeps a second config.yaml in a hidden folder, W&B in its own.
-            below[:] = [name for name in below if name[0] != "." and name != "wandb"]
-            hits += [Path(folder)] * (CONFIG in files)
+            # Hydra keeps a second config.yaml in a hidden folder, W&B in a run's.
+            run = CONFIG in files
+            below[:] = [x for x in below if x[0] != "." and not (run and x == "wandb")]
+            hits += [Path(folder)] * run
         for path in sorted(hits):
             found.setdefault(path.resolve(), path)
     return list(found.values())
@@ -221,7 +222,7 @@ def _read(folder: Path) -> _Run:
         if (at := content["evaluations"][-1]["step"]) != steps:
             content["suite"] += f"-at-{at}"
         rows.append(suite_episodes(content))
-        protocols.append(_protocol(content, steps))
+        protocols.append(_protocol(content))
         versions.append(content["versions"])
     episodes = pd.concat(rows)
     if not np.isfinite(episodes["score"]).all():
@@ -278,13 +279,12 @@ def _episodes(
     return frame.assign(suite=suite, disturbance=level["name"])
 
 
-def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
+def _protocol(content: Mapping[str, Any]) -> dict[str, str]:
     """Return the facts that must be equal in comparable results of a suite."""
     evaluations = content["evaluations"]
-    at = [each["step"] for each in evaluations]
     facts = {
         "suite": content["suite"],
-        "checkpoints": f"last {len(at)}" if at[-1] == steps else at,
+        "checkpoints": f"last {len(evaluations)}",
         "seeds": [each["clean"]["seeds"] for each in evaluations],
         "levels": content["levels"],
     }

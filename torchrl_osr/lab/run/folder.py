@@ -19,7 +19,6 @@ from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
-from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.lab.data import EnvironmentSpec
@@ -121,7 +120,7 @@ def open_run(
             except Exception as error:
                 if new and not (folder / "checkpoint").exists():  # nothing was trained
                     (folder / CONFIG).unlink()
-                elif config.force and not new and isinstance(error, CheckpointError):
+                elif config.force and not new and "does not fit this run" in str(error):
                     write_config(folder, stored)  # which its checkpoint fits
                 raise
 
