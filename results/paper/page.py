@@ -272,16 +272,17 @@ def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame)
         part = part[part["method"].isin((more, less))]
         seeds = part.groupby(["data", "method"])["seed"].nunique().unstack()
         both = seeds.index[seeds.min(axis=1, skipna=False) >= 3]
+        lead = (theirs[more] - theirs[less]).reindex(both).dropna()
+        both = lead.index if len(lead) else both  # those that the paper prints
         found = differences(part[part["data"].isin(both)], more, less)
         ours = found[1] if found else None
-        quoted = (theirs[more] - theirs[less]).reindex(both).mean()
         seen = "not resolved"
         if ours and not ours.low <= 0 <= ours.high:
             seen = "yes" if ours.low > 0 else "no, the reverse"
         note = "a low score has less to lose" if kind == "lost" else ""
         if short := [TITLES[name] for name in (more, less) if name in TOO_SHORT]:
             seen, note = "cannot judge", f"two minutes are too short for {short[0]}"
-        cells = (number(quoted), str(ours or NOT_RUN), str(len(both)), seen, note)
+        cells = (number(lead.mean()), str(ours or NOT_RUN), str(len(both)), seen, note)
         rows.append([claim, *cells])
     head = ["claim", "paper", "here [95 %]", "data sets", "seen here", "note"]
     return markdown(head, rows)

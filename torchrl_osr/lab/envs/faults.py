@@ -63,7 +63,7 @@ class DynamicsChange(DisturbanceWrapper):
     """Multiply masses, friction and gravity of the environment's model by factors.
 
     A factor of mass is also that of the moments of inertia; MuJoCo's armature and the
-    motors' strength stay. As in ODRL (https://arxiv.org/abs/2410.20750).
+    motors' strength stay. The floor's friction changes, too.
     """
 
     def __init__(
