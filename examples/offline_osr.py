@@ -7,8 +7,8 @@
 
 Out-of-sample State Recovery keeps a policy close to the states of its data. An inverse
 dynamics model learns which action leads from a state, clean or perturbed, to the next
-state of the data. The policy learns to choose that action. docs/results.md says how
-little this teaches about pushes.
+state of the data. The policy learns to choose that action. In our runs this taught
+little about pushes, see docs/results.md.
 
 ``torchrl-osr train`` makes the same run from the same parts, and has the other methods.
 The configuration is in ``conf/``; ``--cfg job --resolve`` prints it.
