@@ -41,6 +41,10 @@ class GlobalGenerators(GlobalRNGState):
         super().load_state_dict(state)
 
 
+class UnfitCheckpointError(CheckpointError):
+    """A whole checkpoint is of another run than the one that asks for it."""
+
+
 class WeightsOnlyAdapter(CheckpointAdapter):
     """Saves ``state_dict()`` with :func:`torch.save`, loads it weights only."""
 
@@ -200,7 +204,7 @@ class Checkpoints:
             try:
                 self._checkpoint.load(path, map_location="cpu")
             except CheckpointError as error:
-                raise CheckpointError(
+                raise UnfitCheckpointError(
                     f"{path} does not fit this run: {error} Resume with the "
                     "configuration that it was written with, or start in another "
                     "folder.",

@@ -29,7 +29,7 @@ Numbers = Sequence[float]
 
 @cache
 def compiled(xml: str, changed: float) -> Any:
-    """Return the model of a description, read anew when the file has changed."""
+    """Return the model of a description; read a changed file again."""
     return mujoco.MjModel.from_xml_path(xml)
 
 

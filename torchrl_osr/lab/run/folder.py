@@ -37,6 +37,7 @@ from torchrl_osr.lab.run.data import set_sizes_from_log
 from torchrl_osr.lab.run.load import POLICY
 from torchrl_osr.lab.run.schema import TrainConfig, method_name
 from torchrl_osr.trainers import Interrupted
+from torchrl_osr.trainers.checkpoints import UnfitCheckpointError
 from torchrl_osr.trainers.interruption import (
     interrupts_kept,
     signals_noted,
@@ -117,11 +118,13 @@ def open_run(
         with _status(folder, finished):
             try:
                 yield Run(config, folder, method)
-            except Exception as error:
+            except UnfitCheckpointError:
+                if config.force and not new:
+                    write_config(folder, stored)  # which its checkpoint fits
+                raise
+            except Exception:
                 if new and not (folder / "checkpoint").exists():  # nothing was trained
                     (folder / CONFIG).unlink()
-                elif config.force and not new and "does not fit this run" in str(error):
-                    write_config(folder, stored)  # which its checkpoint fits
                 raise
 
 
