@@ -17,16 +17,17 @@ class Recorder(gymnasium.Env):
         self.observation_space = box(-np.inf, np.inf, (sensors,), np.float64)
         self.action_space = box(low, high, (size,), np.float32)
         self.falls, self.actions = set(falls), []
+        self.info = {}  # always the same one
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.actions = []
-        return self._observe(), {}
+        return self._observe(), self.info
 
     def step(self, action):
         self.actions.append(np.array(action))
         steps = len(self.actions)
-        return self._observe(), float(steps), steps in self.falls, False, {}
+        return self._observe(), float(steps), steps in self.falls, False, self.info
 
     def _observe(self):
         return np.full(self.observation_space.shape, float(len(self.actions)))

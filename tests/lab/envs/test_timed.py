@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -32,6 +33,15 @@ def test_official_by_hand():
     assert column(played, 1) == [1, 2, 3, 9, 10]
     assert column(played, 2) == [False, False, False, False, True]
     assert flags(played) == [False, False, True, False, False]
+
+
+def test_official_goes_through_the_users_wrappers():
+    env = gymnasium.wrappers.TimeLimit(Recorder(sensors=2), 5)
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    env = gymnasium.wrappers.TransformObservation(env, lambda seen: seen[:1] / 10, box)
+    played = play(ActionKnock(env, 5, mode="official", at=3), 5)
+    assert [step[0].tolist() for step in played] == [[0.1], [0.2], [0.8], [0.9], [1.0]]
+    assert column(played, 3) == [False] * 4 + [True]
 
 
 @pytest.mark.parametrize("fall", [2, 3])

@@ -41,10 +41,9 @@ def mujoco_task(env: gymnasium.Env[Any, Any]) -> Any:
 
 
 def flag(info: dict[str, Any], disturbed: bool) -> dict[str, Any]:
-    """Set ``info["disturbed"]``: whether this disturbance, or one inside it, acted."""
+    """Return info with ``"disturbed"``: whether this one, or one inside it, acted."""
     # A NumPy scalar: TorchRL reads no Python bool from info.
-    info["disturbed"] = np.bool_(disturbed or info.get("disturbed", False))
-    return info
+    return info | {"disturbed": np.bool_(disturbed or info.get("disturbed", False))}
 
 
 class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
@@ -84,5 +83,5 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
         self.acted = self.always
         action = self.act(action)
         observation, reward, terminated, truncated, info = super().step(action)
-        flag(info, self.acted)
+        info = flag(info, self.acted)
         return self.observe(observation), reward, terminated, truncated, info

@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 
 from torchrl_osr._checks import check_at_least, check_choice, check_weight
-from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.envs.disturbance import (
     DisturbanceWrapper,
     Env,
@@ -31,7 +30,7 @@ class TimedDisturbance(DisturbanceWrapper):
     def __init__(self, env: Env, at: At, first: int = 0) -> None:
         self.low, self.high = (at, at + 1) if isinstance(at, int) else at
         if not first <= self.low < self.high:
-            raise ValueError(f"at must be at least {first}, or a range, got {at}.")
+            raise ValueError(f"at must be >= {first}, or a range low < high, got {at}.")
         super().__init__(env)
         self.next_step = 0
 
@@ -59,8 +58,8 @@ class ActionKnock(TimedDisturbance):
       upper bound with probability 1/2. Discrete actions are drawn uniformly.
 
     The agent's last step before the official knock returns the observation after the
-    knock, with the reward and end of the agent's own action. Neither the time limit nor
-    other wrappers see the extra steps. Put this around the bare task.
+    knock, with the reward and end of the agent's own action. The time limit does not
+    count the extra steps.
 
     Keyword Args:
         at: steps of the agent before it; of a range ``(low, high)``, a number from
@@ -112,13 +111,14 @@ class ActionKnock(TimedDisturbance):
     def step(self, action: Vector) -> Step:
         observation, reward, terminated, truncated, info = super().step(action)
         if self.due and not (terminated or truncated):
-            bare = self.unwrapped
+            limited = self.has_wrapper_attr("_elapsed_steps")  # Gymnasium's TimeLimit
+            elapsed = limited and self.get_wrapper_attr("_elapsed_steps")
             for _ in range(self.steps):
-                extra = self.generator.random(bare.action_space.shape) * SMALL
-                observation, *_ = bare.step(extra)
-            space = sorted_space(bare.observation_space)  # as make_environment does
-            observation = np.asarray(gymnasium.spaces.flatten(space, observation))
-            flag(info, True)
+                extra = self.generator.random(self.actions.shape) * SMALL
+                observation, *_ = self.env.step(extra)
+            if limited:
+                self.set_wrapper_attr("_elapsed_steps", elapsed)
+            info = flag(info, True)
         return observation, reward, terminated, truncated, info
 
 
