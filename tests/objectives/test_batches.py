@@ -74,11 +74,14 @@ def test_shape_of_the_batch_changes_no_number(name) -> None:
 def test_batch_is_unchanged_but_for_the_priority(name) -> None:
     loss, batch = make_loss(name), make_batch(name, 10)
     batch["loc"] = torch.ones(10, 2)  # as an actor has written it in a collector
+    batch["one_step"] = batch["next"].clone()
+    batch["one_step", "done"] = batch["next", "done"].float()
     before = batch.clone()
     loss(batch)
     new = set(batch.keys(True, True)) - set(before.keys(True, True))
     assert new == ({"td_error"} if name in WITH_CRITICS else set())
     assert (batch.select(*before.keys(True, True)) == before).all()
+    assert batch["one_step", "done"].dtype == torch.float32
     assert not any(value.requires_grad for value in batch.values(True, True))
 
 

@@ -198,7 +198,7 @@ def _evaluate(
 ) -> tuple[Tensor, list[Tensor]]:
     """Return the values, and the gradient of their sum with these weights, if any."""
     number, chunk = len(flat[0]), max(1, CHUNK_ROWS // len(action))
-    value = state.new_empty(number, len(state))
+    value = log_prob.new_empty(number, len(state))
     gradient = [torch.zeros_like(each) for each in flat]
     for critic in range(number):
         own = [each.detach()[critic : critic + 1].requires_grad_() for each in flat]

@@ -108,7 +108,7 @@ class LossGradients:
             else:
                 self._give_up("it writes into its own tensors")
         except Exception as error:  # whatever a loss does that cannot be traced
-            self._give_up(f"{type(error).__name__}: {str(error).splitlines()[0]}")
+            self._give_up(f"{type(error).__name__}: {error}".splitlines()[0])
             if self.device.type == "cuda":  # it would wait for the end of the capture
                 fresh = torch.Generator(self.device).graphsafe_get_state()
                 self._draws().graphsafe_set_state(fresh)
@@ -148,7 +148,7 @@ class LossGradients:
 
 
 def _total(losses: TensorDictBase) -> Any:
-    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+    return sum(value for key, value in losses.items() if key.startswith("loss"))
 
 
 _OPAQUE = (

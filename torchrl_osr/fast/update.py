@@ -30,7 +30,7 @@ class NonfiniteError(FloatingPointError):
 class FastUpdate:
     """One gradient step a call, faster than a loop of your own.
 
-    It sums the ``loss_*`` entries, goes backward once, steps the optimizer, clears the
+    It sums the ``loss*`` entries, goes backward once, steps the optimizer, clears the
     gradients and moves the target networks. On a CPU it is up to twice as fast as these
     lines of a training loop for small networks, and on a GPU seven times or more. After
     ``warm_up`` updates it repeats a trace of the tensor operations, on a GPU a CUDA
@@ -44,7 +44,7 @@ class FastUpdate:
     ``trace=False`` for a loss that reads numbers from elsewhere, such as a global.
 
     Args:
-        loss_module: any loss module whose ``loss_*`` entries may be summed.
+        loss_module: any loss module whose ``loss*`` entries may be summed.
         optimizer: over its parameters; fused ones are the fastest.
         target_updater: moves the target networks after each update. Default: none.
 

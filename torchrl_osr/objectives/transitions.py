@@ -82,7 +82,7 @@ class Transitions:
     ) -> None:
         self.tensordict, self.keys = tensordict, keys
         optional = {keys.is_synthetic, keys.one_step, keys.steps_to_next_obs, *masks}
-        rows = tensordict.select(*read, *optional, strict=False)
+        rows = tensordict.select(*read, *optional, strict=False).copy()
         if rows.ndim != 1:
             rows = rows.reshape(-1)
         rows = _in_dtype(rows, dtype)

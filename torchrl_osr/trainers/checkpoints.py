@@ -94,7 +94,8 @@ class SamplerState:
             rows = torch.arange(len(self.buffer))
             state["priorities"] = torch.as_tensor(self.sampler._sum_tree[rows])
             state["max_priority"] = self.sampler._max_priority
-            state["beta"] = float(self.sampler.beta)  # a scheduler may move it
+            for name in ("alpha", "beta"):  # schedulers may move them
+                state[name] = float(getattr(self.sampler, name))
         elif self.sampler is not None:
             state["sampler"] = dict(self.sampler.state_dict())
         return state
@@ -102,12 +103,11 @@ class SamplerState:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         self.generator.set_state(state_dict["generator"].cpu())
         if "priorities" in state_dict:
-            priorities = state_dict["priorities"]
+            sampler, priorities = self.sampler, state_dict["priorities"]
             rows = torch.arange(len(priorities))
-            self.sampler._sum_tree[rows] = priorities
-            self.sampler._min_tree[rows] = priorities
-            self.sampler._max_priority = state_dict["max_priority"]
-            self.sampler.beta = state_dict["beta"]
+            sampler._sum_tree[rows] = sampler._min_tree[rows] = priorities
+            sampler._max_priority = state_dict["max_priority"]
+            sampler._alpha, sampler.beta = state_dict["alpha"], state_dict["beta"]
         elif state_dict.get("sampler"):
             self.sampler.load_state_dict(state_dict["sampler"])
 

@@ -300,16 +300,16 @@ class OfflineTrainer(Trainer):
         if step % evaluation.interval and step != self.total_frames:
             return
         try:
-            results = finite_or_none({"step": step, **evaluation.run()})
+            results = finite_or_none({**evaluation.run(), "step": step})
+            # As a checkpoint restores them: sorted, lists for tuples.
+            results = json.loads(json.dumps(results, sort_keys=True))
+            metric = results[evaluation.metric]
         except Exception as error:
             if not self.history:  # no work is lost yet, and the next would fail alike
                 raise
             self.failed_evaluations[step] = f"{type(error).__name__}: {error}"
             log.exception(f"{self.description}: the evaluation of step {step} failed")
             return
-        # As a checkpoint restores them: sorted, lists for tuples.
-        results = json.loads(json.dumps(results, sort_keys=True))
-        metric = results[evaluation.metric]
         self.history.append(results)
         text = "-" if metric is None else f"{metric:.4g}"
         self._bar.set_postfix_str(f"{evaluation.metric} {text}")
@@ -365,13 +365,13 @@ def cut_back(folder: Path, step: int, repeated: Set[str] = frozenset()) -> None:
     Of the numbers that are logged at the step once more, ``repeated``, its row goes.
     A last line that a kill left unfinished goes, too.
     """
-    for path in folder.glob("*.csv"):
+    for path in folder.rglob("*.csv"):  # of "eval/score" in a folder
+        last = step - (path.relative_to(folder).as_posix()[:-4] in repeated)
         with path.open("r+b") as file:
             kept = 0
             for line in file:
-                number = line.split(b",")[0]
-                whole = line.endswith(b"\n") and number.isdigit()
-                if not whole or int(number) > step - (path.stem in repeated):
+                number, end = line.split(b",")[0], line[-1:]
+                if end != b"\n" or not number.isdigit() or int(number) > last:
                     break
                 kept += len(line)
             file.truncate(kept)

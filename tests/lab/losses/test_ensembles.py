@@ -52,6 +52,16 @@ def test_edac_equals_the_restatement(check, number, weight) -> None:
     torch.testing.assert_close(out["diversity"], similarity[0].detach())
 
 
+def test_critics_may_have_dropout() -> None:
+    networks = Networks()
+    for each in networks.critics:
+        each.module.insert(1, nn.Dropout(0.5))
+    loss = EDACLoss(networks.actor, networks.critics, diversity_weight=1.0).double()
+    update_targets(loss)
+    loss.set_vmap_randomness("different")
+    assert all(each.isfinite() for each in loss(make_batch("edac", 10)).values())
+
+
 def test_diversity_by_hand_and_of_a_dead_critic() -> None:
     # Three critics at 0, 90 and 180 degrees have the pairs 0, 0, -1 twice each.
     gradients = torch.tensor([[1.0, 0.0], [0.0, 3.0], [-2.0, 0.0]]).unsqueeze(1)

@@ -93,11 +93,12 @@ class EDACLoss(ActorCriticLoss):
     def gradients_and_values(self, batch: Transitions) -> tuple[Tensor, Tensor]:
         """Return each critic's gradient by the data's action, and value, ``[N, R]``."""
         number, keys = self.num_qvalue_nets, self.tensor_keys
+        mode, apart = self.vmap_randomness, self.deactivate_vmap
         network, params = self.qvalue_network, self.qvalue_network_params
         states = batch.s.select(*state_keys(network.in_keys), strict=False)
         states = states.expand(number, *states.batch_size)
         # Each critic at actions of its own, for its own gradient.
-        critics = _vmap_func(network, (0, 0), pseudo_vmap=self.deactivate_vmap)
+        critics = _vmap_func(network, (0, 0), pseudo_vmap=apart, randomness=mode)
 
         def total(action: Tensor) -> tuple[Tensor, Tensor]:
             rows = critics(states.copy().set(keys.action, action), params)
