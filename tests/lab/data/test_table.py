@@ -145,7 +145,11 @@ def test_several_files_are_one_log(tmp_path):
     paths = [str(save(tmp_path / f"{i}.npz", half)) for i, half in enumerate(halves)]
     names = {"terminated": False}
     parts = [load_dataset(path=path, columns=names)[0] for path in paths]
-    for path in (paths, str(tmp_path / "*.npz")):
+    (tmp_path / "deeper" / "still").mkdir(parents=True)
+    deep = str(save(tmp_path / "deeper" / "still" / "1.npz", halves[1]))
+    _, manifest = load_dataset(path=str(tmp_path / "**" / "*.npz"), columns=names)
+    assert manifest["path"] == [*paths, deep]
+    for path in (paths, str(tmp_path / "*.npz"), [str(tmp_path / "*.npz"), paths[0]]):
         data, manifest = load_dataset(path=path, columns=names)
         assert (data == torch.cat(parts)).all()
         assert manifest["path"] == paths
@@ -240,6 +244,25 @@ def test_wrong_csv_files_are_refused(tmp_path, rows, message):
     (tmp_path / "log.csv").write_text(rows)
     with pytest.raises(ValueError, match=message):
         load_dataset(path=tmp_path / "log.csv")
+
+
+def test_a_file_that_was_cut_off_is_named(tmp_path):
+    robot().to_csv(path := tmp_path / "log.csv.gz", index=False)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"log.csv.gz: .*ended before"):
+        load_dataset(path=path, columns=WANTED)
+
+
+def test_names_of_columns_may_be_numbers(tmp_path):
+    table = np.random.default_rng(0).random((60, 5))
+    table[:, 4] = 20260329 + np.arange(60) // 20
+    names = {"observation": [1, 2], "action": 3, "episode": 4, "terminated": False}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    data, _ = load_dataset(path=tmp_path / "log.csv", columns={"reward": 0, **names})
+    assert data["next", "reward"][0, 0] == np.float32(table[0, 0])
+    pd.DataFrame(np.tile(table, (2, 1))).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(ValueError, match="'episode' 20260329 comes back"):
+        load_dataset(path=tmp_path / "log.csv", columns=names)
 
 
 def test_rows_of_other_shapes_are_refused(tmp_path):

@@ -37,9 +37,8 @@ def main(cfg: DictConfig) -> None:
     """Read the data and print a summary; write nothing."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
     options: Any = OmegaConf.to_object(cfg.data)
-    env: Any = None
-    if not OmegaConf.is_missing(cfg.env, "id"):
-        env = OmegaConf.to_object(cfg.env)
+    missing = OmegaConf.is_missing(cfg.env, "id")
+    env: Any = None if missing else OmegaConf.to_object(cfg.env)
     data, manifest = load_data(env, options, progress=cfg.progress)
     entries = recorded_columns(data, manifest).agg(["min", "mean", "max", "std"]).T
     wrong = [*findings(data, manifest, entries)]
@@ -48,11 +47,13 @@ def main(cfg: DictConfig) -> None:
             space: Any = made.observation_space
         wrong += out_of_space(entries, space.low.tolist(), space.high.tolist())
         if keys := getattr(space, "entries", None):
-            observed = entries.loc["observation"].index
-            pairs = zip(observed, keys, strict=True)
-            entries = entries.rename({name: f"{name} -> {key}" for name, key in pairs})
+            ends = [f" -> {key}" for key in keys] + [""] * (len(entries) - len(keys))
+            pairs = zip(entries.index, ends, strict=True)  # the observation comes first
+            shown = [(part, name + end) for (part, name), end in pairs]
+            entries.index = entries.index.from_tuples(shown)
     files = [options.path] if isinstance(options.path, str) else options.path
-    title = Path(files[0]).name if files else f"{env.name} {options.source}"
+    names = [Path(each).name for each in files or ()]
+    title = ", ".join(names) or f"{env.name} {options.source}"
     print(f"{title}: {overview(data, manifest, entries.loc['action'].index)}\n")
     print(entries.to_string(max_rows=MOST_ENTRIES, float_format="{:.4g}".format))
     print("\nWhat looks wrong:" if wrong else "\nNothing looks wrong.")

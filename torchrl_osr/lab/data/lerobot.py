@@ -63,9 +63,9 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
         for place, rows in log_parts(files, {**known, **columns}, about):
             last = np.r_[np.diff(rows["episode"]) != 0, True]
             flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
-            ended = last & (flag.astype(np.bool_) != by_truncated)
+            ended = np.where(last, 1 - flag if by_truncated else flag, 0)
             total += len(last)
-            yield place, {**rows, "terminated": ended, "truncated": last & ~ended}
+            yield place, {**rows, "terminated": ended, "truncated": last & (ended != 1)}
         if total != info["total_frames"]:
             raise ValueError(
                 f"{folder} holds {total:,} rows where meta/info.json says "

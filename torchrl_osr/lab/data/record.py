@@ -93,10 +93,8 @@ def record_episodes(
                     )
             observation, ended = step["next_observation"], terminated or truncated
     columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    return {
-        name: each.astype(np.float32) if each.dtype.kind == "f" else each
-        for name, each in columns.items()
-    }
+    floats = [name for name, each in columns.items() if each.dtype.kind == "f"]
+    return columns | {name: columns[name].astype(np.float32) for name in floats}
 
 
 def check_log_path(path: Path) -> None:

@@ -63,13 +63,14 @@ def log_files(path: str | Path | Sequence[str]) -> list[Path]:
     files: list[Path] = []
     for each in [path] if isinstance(path, (str, Path)) else path:
         whole = Path(each).expanduser().absolute()
+        there = sorted(glob(str(whole), recursive=True))
         # A name that looks like a pattern is a name.
-        found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
+        found = [whole] if whole.is_file() else [*map(Path, there)]
         files += found
         if not found:
             cure = "give its place (data.path=..., evaluate-offline --data ...)"
             raise FileNotFoundError(f"there is no file {whole}: {cure}")
-    return files
+    return [*dict.fromkeys(files)]
 
 
 def log_parts(
@@ -99,7 +100,7 @@ def log_parts(
                 raise ValueError("it holds no rows; expected at least one transition.")
             if step := about["columns"].get("step"):
                 rows = _sorted(rows, step[0], about)
-        except (OSError, ValueError) as error:
+        except (EOFError, OSError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
         yield f"{file}: ", rows
 
@@ -198,7 +199,8 @@ def find_columns(
             f"data.columns has no {', '.join(unknown)}, only {', '.join(USUAL_NAMES)}."
         )
     endless = wanted.get("terminated") is False
-    found = {part: _named(part, each, names) for part, each in wanted.items() if each}
+    given = {part: each for part, each in wanted.items() if each or type(each) is int}
+    found = {part: _named(part, each, names) for part, each in given.items()}
     free = [name for name in names if name not in {*chain(*found.values())}]
     for part in (part for part in USUAL_NAMES if part not in wanted):
         after = [f"next_{name}" for name in found.get("observation", ())]
@@ -318,7 +320,7 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     """Sort the rows of each episode by its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
     step, unit = given, ""
-    if {*map(len, columns.values())} != {len(given)}:
+    if {*map(len, columns.values())} != {len(episode)}:
         return columns  # which is refused
     if given.dtype.kind not in "biuf":
         try:
@@ -346,9 +348,10 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     if wrong.any():
         row = int(wrong.argmax())
         found = (
-            f"episode {rows['episode'][row]:g} goes from {name!r} {given[order[row]]} "
-            f"to {given[order[row + 1]]}, where steps are {usual:g}{unit} apart, as in "
-            f"{wrong.sum()} places: rows are missing or double, or the rate changes."
+            f"episode {rows['episode'][row]:.0f} goes from {name!r} "
+            f"{given[order[row]]} to {given[order[row + 1]]}, where steps are {usual:g}"
+            f"{unit} apart, as in {wrong.sum()} places: rows are missing or double, or "
+            "the rate changes."
         )
         if (same & (gaps == 0)).any() or "next_observation" not in columns:
             cure = "Resample to one rate, start new episodes, or give next_observation."
