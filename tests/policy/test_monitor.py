@@ -92,9 +92,10 @@ def test_rows_before_a_fall_are_no_data(log):
         fit_monitor(rows, episode, torch.zeros_like(falling))
     with pytest.raises(ValueError, match="need 19 episodes"):
         fit_monitor(rows, episode, episode < 20)  # in the others no row counts
-    rows[7] = torch.nan
-    with pytest.raises(ValueError, match="have NaN"):
-        fit_monitor(rows, episode)
+    for value in (torch.inf, torch.nan):
+        rows[7] = value
+        with pytest.raises(ValueError, match="have NaN"):
+            fit_monitor(rows, episode)
 
 
 def test_calibration_on_other_episodes(log):

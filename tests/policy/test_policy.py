@@ -57,6 +57,9 @@ def test_a_dictionary_is_joined_in_alphabetical_order(make_policy):
     assert policy.act(named) == pytest.approx(policy.act(rows))
     with pytest.raises(ValueError, match="numbers named .*'x'.*columns of the log"):
         policy.act({"v": 0.0, "a": 0.0, "x": 0.0})
+    policy.record["source"] = {"data": "monday.csv"}
+    assert policy.act(many) == pytest.approx(policy.act(rows))
+    policy.record["source"] = {"data": {"observation_names": [*"vaw"]}}
     one = dict(zip("vaw", torch.tensor(rows[0]), strict=True))  # numbers
     assert policy.act(one).numpy() == pytest.approx(policy.act(rows[0]), abs=1e-6)
 

@@ -9,13 +9,12 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule
 
-from torchrl_osr.objectives.networks import distribution, written_entry
+from torchrl_osr.objectives.networks import distribution, head_of, written_entry
 from torchrl_osr.policy.policy import DISTRIBUTIONS, Policy
 
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
@@ -56,9 +55,8 @@ def policy_from_loss(
         >>> policy.act(np.zeros((4, 3))).shape, policy.value(np.zeros((4, 3))).shape
         ((4, 1), (4,))
     """
-    network, kind = loss.actor_network, ""
-    if isinstance(network, ProbabilisticTensorDictSequential):
-        kind = network[-1].distribution_class.__name__
+    network = loss.actor_network
+    kind = getattr(head_of(network)[0], "__name__", "")
     # A policy acts by the mean of a Gaussian actor, which ends in a tanh.
     head = {"IndependentNormal": "TanhDelta"}.get(kind, kind)
     if head not in DISTRIBUTIONS:
@@ -95,6 +93,8 @@ def policy_from_loss(
         "source": {"loss": type(loss).__name__} | dict(source or {}),
         "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
+    precision = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")  # for the comparison
     try:
         for name, x in {"loc": loc, "scale": scale, "low": low, "high": high}.items():
             length = bounded if name in ("low", "high") else inputs
@@ -106,6 +106,8 @@ def policy_from_loss(
             "a network has layers that no policy has, or norm or bounds have another "
             f"length: {error}"
         ) from error
+    finally:
+        torch.set_float32_matmul_precision(precision)
     width = policy.high - policy.low
     if not (width > 0).all() or width.isinf().any():
         raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")

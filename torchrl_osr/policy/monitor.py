@@ -126,8 +126,8 @@ class DataMonitor(nn.Module):
         if counts is not None:  # an episode without such rows promises nothing
             observation, episode = observation[counts], episode[counts]
         score = torch.cat([self(rows)[0] for rows in torch.split(observation, 4096)])
-        if score.isinf().any():
-            raise ValueError("the observations have NaN: leave out such rows.")
+        if score.isinf().any() or observation.isinf().any():
+            raise ValueError("the observations have NaN or infinity: leave these out.")
         numbers, index = torch.unique(episode, return_inverse=True)
         largest = score.new_full([len(numbers)], -math.inf)
         largest = largest.scatter_reduce(0, index, score, "amax")

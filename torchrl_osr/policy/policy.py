@@ -243,8 +243,9 @@ class Policy(nn.Module):
 
     def _given(self, observation: Any, *, finite: bool = True) -> tuple[Any, Tensor]:
         """Return the observation as one vector, and as rows on the policy's device."""
-        data = self.record.get("source", {}).get("data") or {}
-        given = joined(observation, data.get("observation_names") or ())
+        data = self.record.get("source", {}).get("data")
+        names = data.get("observation_names") if isinstance(data, Mapping) else None
+        given = joined(observation, names or ())
         return given, self._rows("observation", given, self.observation_size, finite)
 
     def _rows(self, name: str, value: Any, size: int, finite: bool = True) -> Tensor:

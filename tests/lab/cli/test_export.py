@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from recorded_logs import make_columns, save
 from untrained_run import make_run
 
-from torchrl_osr import load_policy
+from torchrl_osr import CQLLoss, load_policy, modules
 from torchrl_osr.lab.cli import export
 from torchrl_osr.lab.run.load import load_run_policy
+from torchrl_osr.policy import fit_monitor, policy_from_loss
 
 
 def test_from_a_run_to_each_kind_of_file(tmp_path, run):
@@ -47,6 +49,14 @@ def test_a_monitor_of_the_runs_data(tmp_path, run):
     given += ["monitor.episodes=own.npz", "monitor.false_alarms=0.01"]
     output = run(tmp_path, "export", "run", "m.pt2", *given)
     assert "100 episodes of own.npz" in output
+
+
+def test_scores_of_one_sensor_round_and_are_no_deviation(tmp_path):
+    loss = CQLLoss(modules.tanh_gaussian_actor(1, 1), modules.critic_ensemble(1, 1))
+    policy, rows = policy_from_loss(loss), torch.randn(400, 1)
+    policy.attach(fit_monitor(rows, torch.arange(400) // 10))
+    policy.export(tmp_path / "p.onnx")
+    assert export.check(policy, tmp_path / "p.onnx", "action") < 1e-5
 
 
 def test_a_file_that_deviates_is_reported(tmp_path):
