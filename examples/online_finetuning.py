@@ -150,6 +150,8 @@ def main(arguments: Sequence[str]) -> None:
             f"{options.run} is no run of loss=osr or loss=osr_10 with a simulator."
         )
     if options.min_q_weight is not None:
+        if not run.loss.has_cql:
+            parser.error(f"{options.run} was trained without CQL's term.")
         run.loss.min_q_weight = options.min_q_weight
     options.output.mkdir(parents=True, exist_ok=True)
     record = {

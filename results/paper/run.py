@@ -223,6 +223,11 @@ def pack(folders: Sequence[Path], to: Path) -> None:
         key = ["data", "method", "seed"]
         again = old["runs"].merge(new["runs"][key])["run"]
         shift = old["runs"]["run"].max() + 1
+        kept = old["runs"].query("run not in @again")
+        scores = pd.concat([kept, new["runs"]]).groupby("data")["data_score"]
+        if (two := scores.nunique() > 1).any():  # machines round in different ways
+            names = ", ".join(two.index[two])
+            sys.exit(f"The tables' runs on {names} had other data. Make all of them.")
     for name, rows in new.items():
         if name == "states" and name in old:  # a mark stands for a list of states
             rows = rows[~rows["states"].isin(old[name]["states"])]

@@ -161,7 +161,7 @@ def test_evaluations_that_fail_are_told_when_the_policy_is_saved(tmp_path):
 def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
     record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
     with np.load(log) as columns:
-        action = columns["action"]
+        action, changed = columns["action"], {**columns}
     given = "env=none", f"data.path={log}"
     run = trained(tmp_path / "run", *given)
     assert "the policy is trained, and was never played" in capsys.readouterr().out
@@ -172,6 +172,11 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
     assert env.action_low == pytest.approx([action.min() - margin])
     assert env.action_high == pytest.approx([action.max() + margin])
     trained(run, *given, "trainer.steps=20")
+    np.savez(log, **changed | {"reward": 2 * changed["reward"]})
+    more = f"resume={run}", "trainer.steps=30"
+    with pytest.raises(ValueError, match=r"log\.npz has other contents"):
+        trained_on(run, *more)
+    trained_on(run, *more, "force=true")
     log.unlink()  # from here on the run is enough
     policy = load_run_policy(run)
     assert (policy.low, policy.high) == (*env.action_low, *env.action_high)

@@ -19,8 +19,9 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     names = [*states[::-1], "act", "reward"]
     frame = pd.DataFrame(rng.random((60, 13)), columns=names)
     frame = frame.assign(terminated=0, episode=[f"run{row // 20}" for row in range(60)])
+    frame["time"] = pd.date_range("2026-03-29", periods=60, freq="20ms", tz="CET")
     small = [each for each in SMALL if not each.startswith("data.num")][1:]
-    given = "loss=td3_bc", "data.action_bounds=[-1,3]"
+    given = "loss=td3_bc", "data.action_bounds=[-1,3]", "data.columns.step=time"
     with pytest.raises(ValueError, match=r"'act' holds other than numbers"):
         fit(frame.assign(act="left"), folder, *small, *given)
     (folder / "policy.safetensors").touch()

@@ -42,9 +42,8 @@ def main() -> None:
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
     for name in ("steps", "frame_skip"):
-        if options[name] is not None and options[name] < 1:
-            name, found = name.replace("_", "-"), options[name]
-            parser.error(f"--{name} {found}; expected at least 1.")
+        if (found := options[name]) is not None and found < 1:
+            parser.error(f"--{name.replace('_', '-')} {found}; expected at least 1.")
     for run in runs:
         if "=" in str(run) and not run.exists():
             parser.error(f"{run} is no run; options have the form --data PATH.")

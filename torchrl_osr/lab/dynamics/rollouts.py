@@ -99,7 +99,8 @@ def task_limits(
         raise ValueError(
             f"{1 - len(missed) / number:.0%} of the log's ends are where an observed "
             "number leaves its range; expected 90 %. Rollouts of a model do not know "
-            "where this task ends: do without them."
+            "where this task ends: do without them, or give next_observation if the "
+            "log lacks the states in which episodes ended."
         )
     limits = limits.view(2, -1)
     ends = [
@@ -164,12 +165,8 @@ def rollout(
         after = {"observation": model.observed(following), "reward": reward}
         after |= {"done": ended, "terminated": ended}
         after["truncated"] = torch.zeros_like(ended)
-        entries = {
-            "observation": seen,
-            "action": action,
-            "next": after,
-            "uncertainty": (scale * units).norm(dim=-1).amax(0).unsqueeze(-1),
-        }
+        entries = {"observation": seen, "action": action, "next": after}
+        entries["uncertainty"] = (scale * units).norm(dim=-1).amax(0).unsqueeze(-1)
         kept.append(TensorDict(entries, [len(state)])[finite])
         state = following[finite & ~ended.squeeze(-1)]
         if not len(state):

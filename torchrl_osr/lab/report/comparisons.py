@@ -161,8 +161,8 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         if each.estimate and each.verdict in ("better", "worse"):
             sentences.append(
                 f"{each.method} is {each.verdict} than {reference} in "
-                f"{each.quantity.name} on {each.data}: {each.estimate:+}, "
-                f"{each.seeds} pairs of runs a data set."
+                f"{each.quantity.name} on {each.data}: {each.estimate:+}, {each.seeds} "
+                f"pairs of runs a data set{each.note and f' ({each.note})'}."
             )
         else:
             rest.setdefault((each.quantity.name, each.verdict), []).append(each.method)

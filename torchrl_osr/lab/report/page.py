@@ -108,7 +108,7 @@ def learning_curves(tables: RunTables) -> Figure:
         axes.axhline(level, color=GREY, linewidth=1, linestyle=":")
         axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
         axes.set_axisbelow(True)
-        axes.tick_params(labelsize=7.5)
+        axes.tick_params(labelsize=7.5, labelbottom=True)
         axes.set_title(_wrapped(data, 100 // columns), fontsize=10)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)

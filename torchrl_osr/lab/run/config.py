@@ -35,9 +35,7 @@ TARGET_PACKAGES = (
 """Packages whose public names are allowed as ``_target_``: none of them reads a file or
 imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 
-MAY_BE_0 = (
-    "data.seed", "dynamics.adversarial_steps", "dynamics.perturbed_start_steps",
-)  # fmt: skip
+MAY_BE_0 = "data.seed", "dynamics.adversarial_steps", "dynamics.perturbed_start_steps"
 SHARES = (
     *("data.random_share", "data.held_out", "dynamics.real_ratio"),
     *("dynamics.known_share", "optim.gamma", "optim.tau", "optim.policy_average"),

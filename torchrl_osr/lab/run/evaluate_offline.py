@@ -71,8 +71,7 @@ class OfflineEvaluator:
         }
         if self.xml is not None:
             request |= {"xml": sha256_of(Path(self.xml)), "frame_skip": self.frame_skip}
-        parts = [] if path.is_dir() else [path.stem]
-        parts += [] if self.xml is None else ["body"]
+        parts = [path.stem] * path.is_file() + ["body"] * (self.xml is not None)
         file = run_folder_of(path) / "-".join([*parts, OFFLINE])
         if file.exists() and request.items() <= (known := read_json(file)).items():
             return known

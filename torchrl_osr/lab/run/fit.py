@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from datetime import datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,9 @@ def fit(
         for name, column in columns.items():
             if column.dtype.kind == "O":  # text, or lists of one length
                 columns[name] = plain = np.asarray(column.tolist())
-                if plain.dtype.kind == "O":  # numbers and None, which becomes NaN
-                    columns[name] = plain.astype(float)
+                if plain.dtype.kind == "O":  # times, or numbers and None (NaN)
+                    timed = isinstance(plain.flat[0], datetime)
+                    columns[name] = plain.astype(str if timed else float)
         np.savez(content := BytesIO(), **columns)
         digest = hashlib.sha256(content.getvalue()).hexdigest()
         log = folder / "columns" / digest[:8] / f"{folder.name}.npz"
@@ -78,4 +80,4 @@ def fit(
             train(run)
     finally:
         torch.set_num_threads(num_threads)
-    return load_run_policy(folder)
+    return load_run_policy(folder, settings.trust)

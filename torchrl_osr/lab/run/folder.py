@@ -142,6 +142,7 @@ def _resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> An
     """Return a run's configuration with the overrides of the command line."""
     start: dict[str, Any] = {"resume": None, "trust": [], "force": False}
     there = OmegaConf.create(read_config(folder) | start)
+    there.data.checksum = None  # compared later, unless forced
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, absent = override.key_or_group, object()
         value = OmegaConf.select(composed, key, default=absent)
@@ -242,7 +243,7 @@ def read_status(folder: Path) -> dict[str, Any]:
     try:
         if (folder / LOCK).exists():  # not in a copy; looking leaves no file behind
             FileLock(folder / LOCK).acquire(timeout=0).lock.release()
-    except Timeout:
+    except OSError:  # a Timeout, or another user's lock
         return found
     return found | {"status": "killed", "reason": f"process {found['pid']} is gone"}
 

@@ -132,9 +132,9 @@ def load_switching_policy(
 ) -> SwitchingPolicy:
     """Combine runs of a task to one policy, in the environment's units, on the CPU.
 
-    Each run's policy is rolled out in the models of all runs that have one, or in the
-    first grey box among them, for 40 steps every 10. The mean of all runs' critics
-    values its last state. Several seeds of ``loss=rim`` have all parts.
+    Each run's policy is rolled out in the models of all runs that have one, 20 steps
+    every 4, or in the first grey box among them, 40 steps every 10. The mean of all
+    runs' critics values its last state. Several seeds of ``loss=rim`` have all parts.
 
     They are folders, or checkpoints in them. With ``critics_only`` no model is used.
     ``options`` are those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.

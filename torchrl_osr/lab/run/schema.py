@@ -313,7 +313,7 @@ def register() -> None:
             None if _root_.data.source in RECORDED else value
         ),
         # A part of a folder's name; file systems allow 255 bytes.
-        "short": lambda text: re.sub(r"[^\w.-]+", "-", text)[:200],
+        "short": lambda text: re.sub(r"[^\w.-]+", "-", text, flags=re.A)[:200],
     }
     for name, resolver in resolvers.items():
         OmegaConf.register_new_resolver(name, resolver, replace=True)

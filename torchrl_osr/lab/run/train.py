@@ -297,20 +297,14 @@ def optimizer_of(
     """Return Adam with a learning rate and a schedule for critics and policy each."""
     optim, total = run.config.optim, run.config.trainer.steps
 
-    def cosine(step: int) -> float:
-        return 0.5 * (1 + math.cos(math.pi * min(step / total, 1)))
+    def factor(step: int) -> float:
+        share = min(step / total, 1) if optim.actor_schedule == "cosine" else 0.0
+        return 0.5 * (1 + math.cos(math.pi * share))
 
-    factors = {"cosine": cosine, "constant": lambda _: 1.0}
-    groups, schedules = [], []
-    for params, rate, schedule in (
-        (critics, optim.qvalue_lr, "constant"),
-        (policy, optim.actor_lr, optim.actor_schedule),
-    ):
-        if params:
-            groups.append({"params": params, "lr": rate})
-            schedules.append(factors[schedule])
-    optimizer = adam(groups)
-    return optimizer, LambdaLR(optimizer, schedules)
+    groups = [{"params": critics, "lr": optim.qvalue_lr}] * bool(critics)
+    optimizer = adam([*groups, {"params": policy, "lr": optim.actor_lr}])
+    factors: list[Any] = [lambda _: 1.0] * len(groups)
+    return optimizer, LambdaLR(optimizer, [*factors, factor])
 
 
 def averaged(network: torch.nn.Module, share: float) -> AveragedModel:
