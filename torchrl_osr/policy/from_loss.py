@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from importlib.metadata import version
 from typing import Any
 
@@ -93,8 +94,6 @@ def policy_from_loss(
         "source": {"loss": type(loss).__name__} | dict(source or {}),
         "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
-    precision = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")  # for the comparison
     try:
         for name, x in {"loc": loc, "scale": scale, "low": low, "high": high}.items():
             length = bounded if name in ("low", "high") else inputs
@@ -106,8 +105,6 @@ def policy_from_loss(
             "a network has layers that no policy has, or norm or bounds have another "
             f"length: {error}"
         ) from error
-    finally:
-        torch.set_float32_matmul_precision(precision)
     width = policy.high - policy.low
     if not (width > 0).all() or width.isinf().any():
         raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
@@ -148,13 +145,16 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
 
     Anything around an MLP would be left out: other layers and other bounds.
     """
-    generator = torch.Generator().manual_seed(0)
+    place = next(loss.parameters()).device
+    # A GPU may round float32 to ten bits (TF32); Apple's have no float64.
+    dtype = torch.float32 if place.type == "mps" else torch.float64
+    policy, generator = deepcopy(policy).to(dtype), torch.Generator().manual_seed(0)
     rows = policy.loc.repeat(16, 1).normal_(generator=generator)
     rows *= torch.logspace(0, 1.5, 16).to(rows).unsqueeze(1)  # some beyond a clip
-    place = next(loss.parameters())
-    states = TensorDict({}, [len(rows)], device=place.device)
+    states = TensorDict({}, [len(rows)], device=place)
     states.set(loss.actor_network.in_keys[0], rows.to(place))
-    theirs = distribution(loss.actor_network, loss.actor_network_params, states)
+    params = loss.actor_network_params.detach().to(dtype)
+    theirs = distribution(loss.actor_network, params, states)
     raw = policy.actor(rows)
     pairs = [(policy.mode(raw), theirs.deterministic_sample)]
     if policy.discrete:
@@ -162,11 +162,12 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
     states.set(loss.tensor_keys.action, theirs.deterministic_sample)
     given = (rows,) if policy.discrete else (rows, policy.mode(raw))
     for number, critic in enumerate(policy.critics):
-        network, params = loss.qvalue_network, loss.qvalue_network_params[number]
+        network = loss.qvalue_network
+        params = loss.qvalue_network_params[number].detach().to(dtype)
         value = written_entry(network, params, states, network.out_keys[-1])
         pairs.append((critic(*given), value))
     for ours, wanted in pairs:
-        if not torch.allclose(ours, wanted.cpu().float(), rtol=1e-4, atol=1e-5):
+        if not torch.allclose(ours, wanted.cpu().to(dtype), rtol=1e-4, atol=1e-5):
             raise ValueError(
                 f"the networks of this {type(loss).__name__} compute something else "
                 "than their MLPs and a distribution with bounds -1 and 1. Build them "

@@ -104,9 +104,10 @@ def test_columns_and_terminal_ends_are_chosen(edited, change, columns, terminate
         assert data["next", "reward"][:8, 0] == pytest.approx(np.arange(8) / 20)
 
 
-def test_a_flag_that_is_no_flag_is_refused(edited):
-    with pytest.raises(ValueError, match=r"'terminated' .*expected bool, or 0 and 1"):
-        load(edited(lambda table: table), columns={"terminated": "timestamp"})
+@pytest.mark.parametrize("flag", ["terminated", "truncated"])
+def test_a_flag_that_is_no_flag_is_refused(edited, flag):
+    with pytest.raises(ValueError, match=f"'{flag}' holds 0.4.*expected bool, or 0 and 1"):
+        load(edited(lambda table: table), columns={flag: "timestamp"})
 
 
 def test_a_folder_that_cannot_be_read_is_an_error_with_its_cure(edited, tmp_path):

@@ -49,7 +49,7 @@ def main(cfg: DictConfig) -> None:
         if keys := getattr(space, "entries", None):
             ends = [f" -> {key}" for key in keys] + [""] * (len(entries) - len(keys))
             pairs = zip(entries.index, ends, strict=True)  # the observation comes first
-            shown = [(part, name + end) for (part, name), end in pairs]
+            shown = [(part, f"{name}{end}") for (part, name), end in pairs]
             entries.index = entries.index.from_tuples(shown)
     files = [options.path] if isinstance(options.path, str) else options.path
     names = [Path(each).name for each in files or ()]

@@ -349,14 +349,14 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
             row = int(wrong.argmax())
             raise ValueError(
                 f"row {row} ends its episode, and row {row + 1} belongs to the same "
-                f"'episode' {columns['episode'][row]:.0f}, as in {wrong.sum()} rows: "
+                f"'episode' {columns['episode'][row]:.15g}, as in {wrong.sum()} rows: "
                 "the flags may be late, or the rows in another order."
             )
         ends |= ~same
         numbers, times = np.unique(episode[ends], return_counts=True, equal_nan=False)
         if (times > 1).any():
             raise ValueError(
-                f"'episode' {numbers[times > 1][0]:.0f} comes back; expected its rows "
+                f"'episode' {numbers[times > 1][0]:.15g} comes back; expected its rows "
                 "together. data.columns.step sorts them."
             )
     return flagged, ends

@@ -48,9 +48,9 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
         for part, names in KNOWN_NAMES.items()
         if (there := [name for name in names if name in features])
     }
-    by_truncated = "truncated" in {**known, **columns} and "terminated" not in columns
-    if by_truncated:
-        known["terminated"] = False
+    flag, other = "terminated", "truncated"
+    if "truncated" in {**known, **columns} and "terminated" not in columns:
+        flag, other, known["terminated"] = other, flag, False
     about: dict[str, Any] = {"source": "lerobot", "path": str(folder)}
     about["entry_names"] = {name: _entry_names(each) for name, each in features.items()}
     cameras = [n for n, each in features.items() if each["dtype"] in ("video", "image")]
@@ -62,10 +62,9 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
         total = 0
         for place, rows in log_parts(files, {**known, **columns}, about):
             last = np.r_[np.diff(rows["episode"]) != 0, True]
-            flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
-            ended = np.where(last, 1 - flag if by_truncated else flag, 0)
+            ends = np.where(last, np.reshape(rows[flag], -1), 0)
             total += len(last)
-            yield place, {**rows, "terminated": ended, "truncated": last & (ended != 1)}
+            yield place, {**rows, flag: ends, other: last & (ends != 1)}
         if total != info["total_frames"]:
             raise ValueError(
                 f"{folder} holds {total:,} rows where meta/info.json says "

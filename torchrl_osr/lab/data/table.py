@@ -6,6 +6,7 @@ import codecs
 import csv
 import gzip
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
@@ -70,7 +71,7 @@ def log_files(path: str | Path | Sequence[str]) -> list[Path]:
         if not found:
             cure = "give its place (data.path=..., evaluate-offline --data ...)"
             raise FileNotFoundError(f"there is no file {whole}: {cure}")
-    return [*dict.fromkeys(files)]
+    return [*{each.resolve(): each for each in files}.values()]  # of links, one
 
 
 def log_parts(
@@ -100,7 +101,7 @@ def log_parts(
                 raise ValueError("it holds no rows; expected at least one transition.")
             if step := about["columns"].get("step"):
                 rows = _sorted(rows, step[0], about)
-        except (EOFError, OSError, ValueError) as error:
+        except (EOFError, OSError, ValueError, zlib.error) as error:
             raise ValueError(f"{file}: {error}") from error
         yield f"{file}: ", rows
 
@@ -348,7 +349,7 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     if wrong.any():
         row = int(wrong.argmax())
         found = (
-            f"episode {rows['episode'][row]:.0f} goes from {name!r} "
+            f"episode {rows['episode'][row]:.15g} goes from {name!r} "
             f"{given[order[row]]} to {given[order[row + 1]]}, where steps are {usual:g}"
             f"{unit} apart, as in {wrong.sum()} places: rows are missing or double, or "
             "the rate changes."

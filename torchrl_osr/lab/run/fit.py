@@ -61,7 +61,7 @@ def fit(
             if column.dtype.kind == "O":  # text, or lists of one length
                 columns[name] = plain = np.asarray(column.tolist())
                 if plain.dtype.kind == "O":  # times, or numbers and None (NaN)
-                    timed = isinstance(plain.flat[0], datetime)
+                    timed = any(isinstance(each, datetime) for each in plain.flat)
                     columns[name] = plain.astype(str if timed else float)
         np.savez(content := BytesIO(), **columns)
         digest = hashlib.sha256(content.getvalue()).hexdigest()

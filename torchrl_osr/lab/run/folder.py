@@ -135,7 +135,7 @@ def _absolute(path: Any) -> Any:
     if not path:
         return path
     full = str(Path(path).expanduser().absolute())
-    return full if Path(full).exists() or glob(full) else path
+    return full if Path(full).exists() or glob(full, recursive=True) else path
 
 
 def _resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Any:
