@@ -426,6 +426,7 @@ def fill_readme(means: pd.DataFrame) -> None:
         for name, line in means.iterrows()
         if name in firsts
     ]
+    rows += [f"|{firsts[name]}|||\n" for name in firsts if name not in means.index]
     path.write_text(text.replace(found[2], "".join(rows)), encoding="utf-8")
 
 
