@@ -68,7 +68,7 @@ def test_a_description_that_has_changed_is_read_anew(tmp_path) -> None:
 def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:
     state = torch.randn(1000, 11)
     state[:, 10].clamp_(max=0.5)
-    after = {"observation": state.roll(1, 0)}
+    after = {"observation": state.roll(1, 0), "terminated": torch.zeros(1000, 1)}
     rows = TensorDict({"observation": state, "next": after}, [1000])
     body = Body(HOPPER.fullpath, 4).limited(rows)
     assert body.most[10] == 0.5
@@ -79,6 +79,19 @@ def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:
     state[:, 10] = 0.0
     with pytest.raises(ValueError, match="an observed number is at its limit or never"):
         fitted_body(body, rows, seed=0)
+
+
+def test_rows_without_a_next_state_identify_no_body(capsys) -> None:
+    rows = played(HOPPER, 60)
+    rows["next", "terminated"] = torch.zeros(60, 1, dtype=torch.bool)
+    ends = rows[:20].clone()
+    ends["next", "observation"] = ends["observation"]
+    ends["next", "terminated"] = ~ends["next", "terminated"]
+    body = Body(HOPPER.fullpath, HOPPER.frame_skip)
+    wanted, _ = fitted_body(body, rows, seed=0)
+    found, left = fitted_body(body, torch.cat([rows, ends]), seed=0)
+    assert found == wanted
+    assert len(left) <= 60
 
 
 GREY = [

@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torch import nn
 from uneven_dynamics import compare_models, linear_dynamics, plain_gaussian
 
+from torchrl_osr.lab.data.transitions import has_next_state
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, TransitionVAELoss
-from torchrl_osr.lab.dynamics.models import has_next_state
 
 
 def rows_of(state, action, change, reward) -> TensorDict:

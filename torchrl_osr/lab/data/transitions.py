@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_osr._entries import column, entry
 
 VECTOR_KEYS: tuple[NestedKey, ...] = ("observation", ("next", "observation"), "action")
 FLAG_KEYS: tuple[NestedKey, ...] = tuple(
@@ -36,6 +39,15 @@ def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
     return TensorDict(rows | {"next": after}, [len(columns["reward"])])
 
 
+def has_next_state(data: TensorDictBase) -> Tensor:
+    """Return which of the transitions ``[B]`` have a next state, bool ``[B]``.
+
+    Readers repeat the state where a recording lacks the next one of a terminated row.
+    """
+    same = (entry(data, ("next", "observation")) == entry(data, "observation")).all(-1)
+    return ~(same & column(data, ("next", "terminated")).bool())
+
+
 def check_dataset(data: TensorDictBase) -> None:
     """Raise unless ``data``, transitions ``[N]``, can be trained on.
 
@@ -44,16 +56,16 @@ def check_dataset(data: TensorDictBase) -> None:
     """
     rows = len(data) if data.ndim == 1 else 0
     for key in DATASET_KEYS:
-        column = data[key]
+        values = data[key]
         size = data["action" if key == "action" else "observation"].shape[-1]
         shape = [rows, size if key in VECTOR_KEYS else 1]
         dtype = torch.bool if key in FLAG_KEYS else torch.float32
-        if not rows or [*column.shape] != shape or column.dtype != dtype:
+        if not rows or [*values.shape] != shape or values.dtype != dtype:
             raise ValueError(
-                f"{key!r} has shape {[*column.shape]} and type {column.dtype}; "
+                f"{key!r} has shape {[*values.shape]} and type {values.dtype}; "
                 f"expected {shape} and {dtype}, in a flat set with at least one row."
             )
-        extremes = torch.stack(column.aminmax())  # without a copy of the column
+        extremes = torch.stack(values.aminmax())  # without a copy of the column
         if not extremes.isfinite().all():
             raise ValueError(f"{key!r} holds NaN or infinity.")
         if key in VECTOR_KEYS and not extremes.any():

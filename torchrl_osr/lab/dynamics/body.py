@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.lab.data.transitions import VECTOR_KEYS
+from torchrl_osr.lab.data.transitions import VECTOR_KEYS, has_next_state
 
 Numbers = Sequence[float]
 
@@ -188,6 +188,7 @@ def fitted_body(body: Body, rows: TensorDict, *, seed: int) -> tuple[Body, Tenso
         The body, and the rows within its limits, with ``"simulated"``: what it predicts
         instead of the next observation.
     """
+    rows = rows[has_next_state(rows)]
     body = body.limited(rows)
     rows = rows[body.shows(rows)].cpu()
     if not len(rows):

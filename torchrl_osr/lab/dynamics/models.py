@@ -17,6 +17,7 @@ from torch.nn.functional import softplus
 
 from torchrl_osr._entries import column, entry
 from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.lab.data.transitions import has_next_state
 from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.modules.actor import mlp
 from torchrl_osr.modules.inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
@@ -213,15 +214,6 @@ def copy_statistics(values: Tensor, loc: Tensor, scale: Tensor) -> None:
     std, mean = torch.std_mean(values.double(), 0, correction=0)
     loc.copy_(mean)
     scale.copy_(torch.where(std > 1e-8, std, torch.ones_like(std)))
-
-
-def has_next_state(data: TensorDictBase) -> Tensor:
-    """Return which of the transitions ``[B]`` have a next state, bool ``[B]``.
-
-    Readers repeat the state where a recording lacks the next one of a terminated row.
-    """
-    same = (entry(data, ("next", "observation")) == entry(data, "observation")).all(-1)
-    return ~(same & column(data, ("next", "terminated")).bool())
 
 
 def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:

@@ -23,7 +23,6 @@ from torchrl_osr.lab.dynamics.models import (
     TransitionVAE,
     TransitionVAELoss,
     gaussian_error,
-    has_next_state,
 )
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
@@ -145,7 +144,7 @@ def _with_body(
     bounds = {"low": data.action_low, "high": data.action_high}
     body = options.body(loc=data.loc.tolist(), scale=data.scale.tolist(), **bounds)
     rows = data.storage[:].select("observation", "action", "next")
-    model.body, rows = fitted_body(body, rows[has_next_state(rows)], seed=data.seed)
+    model.body, rows = fitted_body(body, rows, seed=data.seed)
     device = data.held_out.device or "cpu"
     return replace(data, storage=TensorStorage(rows.to(device), device=device))
 

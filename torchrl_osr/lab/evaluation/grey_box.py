@@ -12,7 +12,6 @@ from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import Body, DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.body import fitted_body
-from torchrl_osr.lab.dynamics.models import has_next_state
 from torchrl_osr.lab.dynamics.rollouts import task_limits, termination
 from torchrl_osr.lab.evaluation.episodes import UnitPolicy
 from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
@@ -39,7 +38,7 @@ def fitted_grey_box(
             *sizes, num_networks=1, num_elites=1, num_cells=cells
         )
     dynamics.limits.copy_(task_limits(data))
-    dynamics.body, rows = fitted_body(body, data[has_next_state(data)], seed=seed)
+    dynamics.body, rows = fitted_body(body, data, seed=seed)
     dynamics.standardize_(rows)
     optimizer = torch.optim.Adam(dynamics.parameter_groups(), lr=1e-3, fused=True)
     update = FastUpdate(DynamicsLoss(dynamics), optimizer)
